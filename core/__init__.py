@@ -1,0 +1,1 @@
+"""The nouns of orthostream: pure functions from arrays and bytes to values."""

@@ -1,0 +1,1 @@
+"""The face and the memory of orthostream: HTTP, pages, tables, objects, queue names."""

@@ -1,0 +1,1 @@
+"""The verbs of orthostream: one file per stage, read in flow order."""
