@@ -42,7 +42,7 @@ class Camera:
             for _ in range(10):
                 r2 = (xy**2).sum(1, keepdims=True)
                 xy = distorted / (1 + self.k1 * r2 + self.k2 * r2**2)
-        return np.c_[xy, np.ones(len(xy))]
+        return np.column_stack((xy, np.ones(len(xy))))
 
     def project(self, xyz_cam: Array) -> Array:
         """Points (N, 3) in the camera's frame, metres, z > 0 → pixels (N, 2)."""
@@ -142,11 +142,13 @@ def _ecef(lon_lat_alt: Array) -> Array:
     lon, lat = np.radians(lon_lat_alt[:, 0]), np.radians(lon_lat_alt[:, 1])
     alt = lon_lat_alt[:, 2]
     n = WGS84_A_M / np.sqrt(1 - WGS84_E2 * np.sin(lat) ** 2)
-    return np.c_[
-        (n + alt) * np.cos(lat) * np.cos(lon),
-        (n + alt) * np.cos(lat) * np.sin(lon),
-        (n * (1 - WGS84_E2) + alt) * np.sin(lat),
-    ]
+    return np.column_stack(
+        (
+            (n + alt) * np.cos(lat) * np.cos(lon),
+            (n + alt) * np.cos(lat) * np.sin(lon),
+            (n * (1 - WGS84_E2) + alt) * np.sin(lat),
+        )
+    )
 
 
 def _geodetic(xyz: Array) -> Array:
@@ -159,4 +161,4 @@ def _geodetic(xyz: Array) -> Array:
         lat = np.arctan2(xyz[:, 2] + WGS84_E2 * n * np.sin(lat), p)
     n = WGS84_A_M / np.sqrt(1 - WGS84_E2 * np.sin(lat) ** 2)
     alt = p * np.cos(lat) + xyz[:, 2] * np.sin(lat) - n * (1 - WGS84_E2 * np.sin(lat) ** 2)
-    return np.c_[np.degrees(lon), np.degrees(lat), alt]
+    return np.column_stack((np.degrees(lon), np.degrees(lat), alt))
