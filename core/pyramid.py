@@ -1,0 +1,74 @@
+"""The pyramid of tiles: every overview is the reduction of its four children; and a tile's bytes.
+
+Tiles are RGBA (512, 512, 4) uint8, alpha not premultiplied. Opaque tiles become JPEG, tiles with alpha WebP,
+fully transparent ones are not stored at all. Equal pixels give equal bytes.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+from PIL import Image
+
+from core.grid import TILE_PX
+
+Rgba = NDArray[np.uint8]
+
+JPEG = "image/jpeg"
+WEBP = "image/webp"
+QUALITY = 80
+
+
+def reduce(children: Sequence[Rgba | None]) -> Rgba:
+    """Four tiles NW, NE, SW, SE (None = transparent) → their parent, the alpha-weighted 2 × 2 mean."""
+    canvas = np.zeros((2 * TILE_PX, 2 * TILE_PX, 4), np.uint8)
+    for k, child in enumerate(children):
+        if child is not None:
+            row, col = divmod(k, 2)
+            canvas[row * TILE_PX :, col * TILE_PX :][:TILE_PX, :TILE_PX] = child
+    return halve(canvas)
+
+
+def halve(rgba: Rgba) -> Rgba:
+    """The 2 × 2 area mean, weighted by alpha, of RGBA (2H, 2W, 4) uint8 → (H, W, 4) uint8."""
+    height, width = rgba.shape[0] // 2, rgba.shape[1] // 2
+    if (rgba[..., 3] == 255).all():
+        # INTER_AREA by exactly 2 is integer: (a + b + c + d + 2) >> 2.
+        return np.asarray(cv2.resize(rgba, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    # Sums of four products stay below 2^24, so float32 is exact until the one division.
+    alpha = rgba[..., 3].astype(np.float32)
+    premultiplied = rgba.astype(np.float32)
+    premultiplied[..., :3] *= alpha[..., None]
+    mean = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)
+    mean[..., :3] /= np.maximum(mean[..., 3:], 0.25)
+    return np.asarray(mean + np.float32(0.5), np.uint8)
+
+
+def encode(rgba: Rgba, quality: int = QUALITY) -> tuple[bytes, str] | None:
+    """A tile's bytes and media type: JPEG when opaque, WebP when not, None when nothing of it is known."""
+    alpha = rgba[..., 3]
+    if not alpha.any():
+        return None
+    if (alpha == 255).all():
+        pixels = np.ascontiguousarray(rgba)
+        return simplejpeg.encode_jpeg(
+            pixels, quality=quality, colorspace="RGBX", colorsubsampling="420"
+        ), JPEG
+    out = io.BytesIO()
+    # method 0: four times faster than the default for a tenth more bytes.
+    Image.fromarray(rgba, "RGBA").save(out, "WEBP", quality=quality, method=0)
+    return out.getvalue(), WEBP
+
+
+def decode(data: bytes) -> Rgba:
+    """The inverse of `encode`, as far as its losses allow: a tile's bytes → RGBA (H, W, 4) uint8."""
+    if data[:2] == b"\xff\xd8":
+        rgba = simplejpeg.decode_jpeg(data, colorspace="RGBA")
+        return np.asarray(rgba, np.uint8)
+    with Image.open(io.BytesIO(data)) as image:
+        return np.asarray(image.convert("RGBA"), np.uint8)
