@@ -150,7 +150,7 @@ def _decode_tiff(data: bytes) -> Pixels:
 
 
 def _unrotated(data: bytes) -> bytes:
-    """The same TIFF with EXIF orientation 1: Pillow turns TIFFs by it, which would leave the sensor's frame."""
+    """The same TIFF with EXIF orientation 1: Pillow turns TIFFs by it, out of the sensor's frame."""
     order: Literal["little", "big"] = "little" if data[:1] == b"I" else "big"
     start = int.from_bytes(data[4:8], order)
     for at in range(start + 2, start + 2 + 12 * int.from_bytes(data[start : start + 2], order), 12):
@@ -160,7 +160,7 @@ def _unrotated(data: bytes) -> bytes:
 
 
 def _stretched(values: NDArray[np.float32]) -> Pixels:
-    """A deep grey picture (thermal, 16 bits or floats) in 8 bits: by its own range, or it would be all black."""
+    """A deep grey picture (thermal: 16 bits, floats) in 8 bits, by its own range or it would be all black."""
     values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
     low, high = np.percentile(values, (0.5, 99.5))
     return np.asarray(np.rint(np.clip((values - low) * (255 / max(high - low, 1e-9)), 0, 255)), np.uint8)
