@@ -55,7 +55,7 @@ class TooManyPixels(RejectedFrame):
 
 
 class TooFewPixels(RejectedFrame):
-    """The photo is too small to be matched (under 64 pixels a side). Upload the original, not its thumbnail."""
+    """The photo is too small to be matched (under 64 pixels a side). Upload the original, no thumbnail."""
 
     code = "too_few_pixels"
 
@@ -88,3 +88,15 @@ class NothingToMap(OrthostreamError):
     """No photo of the mission could be placed, so that there is no map to make."""
 
     code = "nothing_to_map"
+
+
+class BadCheckpoints(OrthostreamError):
+    """The checkpoint file is not a gcp_list.txt: a line with the CRS, then X Y Z px py image [name]."""
+
+    code = "bad_checkpoints"
+
+
+class BadCrs(OrthostreamError):
+    """The coordinate reference system is not known. Name one such as EPSG:32632."""
+
+    code = "bad_crs"
