@@ -1,0 +1,225 @@
+/** The mission's panel: what came in, what is on the map, what was refused and why, what can be taken away. */
+
+import { missionUrl, type Counts, type ExportDoc, type Frame, type Mission, type MissionState, type Progress } from "./api";
+import { fill, h, icon, ICONS, text } from "./dom";
+import { bytes, count, seconds } from "./format";
+
+const STATE: Record<MissionState, [label: string, tone: string]> = {
+  open: ["Live", "live"],
+  finalising: ["Finalising", "busy"],
+  final: ["Final", "done"],
+  deleting: ["Being deleted", "off"],
+};
+
+const EXPORT_TITLES: Record<string, [title: string, hint: string]> = {
+  "mosaic.tif": ["Orthophoto", "Cloud-optimised GeoTIFF"],
+  "poses.json": ["Camera poses", "JSON, UTM"],
+  "footprints.geojson": ["Footprints", "GeoJSON"],
+  "route.csv": ["Flight route", "CSV"],
+  "report.json": ["Report", "JSON"],
+  "tiles.pmtiles": ["Map tiles", "PMTiles"],
+};
+
+export interface PanelActions {
+  finalise(): void;
+  add(files: File[]): void;
+  toggle(layer: "footprint" | "track", visible: boolean): void;
+  share(): void;
+}
+
+/** How many photos have come at least so far along the chain. */
+export function reached(counts: Counts): { matched: number; posed: number; fused: number } {
+  const fused = counts.fused;
+  const posed = counts.posed + fused;
+  return { matched: counts.matched + posed, posed, fused };
+}
+
+function stat(label: string, hint: string): { root: HTMLElement; value: HTMLElement } {
+  const value = h("dd", {}, "–");
+  return { root: h("div", { class: "stat", title: hint }, h("dt", {}, label), value), value };
+}
+
+export class Panel {
+  readonly root: HTMLElement;
+  private readonly title = h("h1");
+  private readonly pill = h("span", { class: "pill", role: "status" });
+  private readonly offline = h("p", { class: "offline", role: "alert", hidden: true }, "Connection lost. Trying again…");
+  private readonly headline = h("strong", { class: "headline-number" }, "0");
+  private readonly headlineRest = h("span", { class: "muted" }, "photos on the map");
+  private readonly bar = h("div", { class: "bar", role: "img" });
+  private readonly stages = {
+    uploaded: stat("Uploaded", "Photos that arrived and are safe"),
+    matched: stat("Matched", "Compared with their neighbours"),
+    posed: stat("Posed", "Position and direction are known"),
+    fused: stat("On the map", "Pixels are in the published tiles"),
+    rejected: stat("Rejected", "Could not be used; the reasons are below"),
+  };
+  private readonly figures = {
+    rate: stat("Rate", "Photos put on the map per second, over the last minute"),
+    p50: stat("Photo → map", "Median time from upload to visible tile"),
+    p95: stat("95 %", "95 of 100 photos were on the map within this time"),
+    revision: stat("Revision", "How many times the map was published"),
+  };
+  private readonly rejectedCount = h("span", { class: "badge" });
+  private readonly rejectedList = h("ul", { class: "rejected" });
+  private readonly rejected = h("details", { class: "section", hidden: true });
+  private readonly downloads = h("ul", { class: "downloads" });
+  private readonly drones = h("ul", { class: "legend" });
+  private readonly uploadNote = h("p", { class: "note", hidden: true, role: "status" });
+  private readonly finalise: HTMLButtonElement;
+  private readonly finaliseHint = h("p", { class: "note" });
+  private lastDrones = "";
+
+  constructor(private readonly missionId: string, private readonly actions: PanelActions) {
+    this.finalise = h("button", { class: "primary", onclick: () => actions.finalise() }, icon(ICONS.check), "Finalise map");
+    this.rejected.append(h("summary", {}, "Rejected photos", this.rejectedCount), this.rejectedList);
+    this.root = h("aside", { class: "panel", "aria-label": "Mission" }, this.head(), this.body());
+  }
+
+  private head(): HTMLElement {
+    const expand = h("button", { class: "icon-button expand", "aria-label": "Show or hide the details", "aria-expanded": "false" }, icon(ICONS.chevron));
+    expand.addEventListener("click", () => {
+      const open = this.root.classList.toggle("open");
+      expand.setAttribute("aria-expanded", String(open));
+    });
+    return h(
+      "header", { class: "panel-head" },
+      h("div", { class: "crumbs" },
+        h("a", { href: "/", "data-route": true, class: "back" }, icon(ICONS.back), "Missions"),
+        h("button", { class: "icon-button share", title: "Copy the link to this map", "aria-label": "Copy the link to this map", onclick: () => this.actions.share() }, icon(ICONS.link)),
+        expand),
+      h("div", { class: "title-row" }, this.title, this.pill),
+      this.offline,
+      h("p", { class: "headline" }, this.headline, this.headlineRest),
+      this.bar,
+    );
+  }
+
+  private body(): HTMLElement {
+    const input = h("input", { type: "file", multiple: true, accept: "image/jpeg,image/tiff,.jpg,.jpeg,.tif,.tiff,.mpo", hidden: true });
+    input.addEventListener("change", () => {
+      this.actions.add([...(input.files ?? [])]);
+      input.value = "";
+    });
+    const choose = h("button", { class: "quiet", onclick: () => input.click() }, icon(ICONS.upload), "Add photos");
+    return h(
+      "div", { class: "panel-body" },
+      h("dl", { class: "stages" }, ...Object.values(this.stages).map((s) => s.root)),
+      h("dl", { class: "figures" }, ...Object.values(this.figures).map((s) => s.root)),
+      h("section", { class: "section" }, h("h2", {}, "Layers"),
+        this.switch("Photo footprints", "footprint"), this.switch("Flight tracks", "track"), this.drones),
+      this.rejected,
+      h("section", { class: "section" }, h("h2", {}, "Downloads"), this.downloads),
+      h("section", { class: "section actions" }, choose, input, this.finalise, this.uploadNote, this.finaliseHint),
+    );
+  }
+
+  private switch(label: string, layer: "footprint" | "track"): HTMLElement {
+    const input = h("input", { type: "checkbox", checked: true, role: "switch" });
+    input.addEventListener("change", () => this.actions.toggle(layer, input.checked));
+    return h("label", { class: "switch" }, h("span", {}, label), input);
+  }
+
+  setMission(mission: Mission): void {
+    text(this.title, mission.name);
+    this.setProgress(mission.progress);
+  }
+
+  setProgress(progress: Progress): void {
+    const [label, tone] = progress.total || progress.state !== "open" ? STATE[progress.state] : ["Waiting", "off"];
+    text(this.pill, label ?? "");
+    this.pill.dataset["tone"] = tone;
+    const { matched, posed, fused } = reached(progress.counts);
+    const good = progress.total - progress.counts.rejected;
+    text(this.headline, fused.toLocaleString("en"));
+    text(this.headlineRest, `of ${count(good, "photo")} on the map`);
+    text(this.stages.uploaded.value, progress.total.toLocaleString("en"));
+    text(this.stages.matched.value, matched.toLocaleString("en"));
+    text(this.stages.posed.value, posed.toLocaleString("en"));
+    text(this.stages.fused.value, fused.toLocaleString("en"));
+    text(this.stages.rejected.value, progress.counts.rejected.toLocaleString("en"));
+    this.stages.rejected.root.classList.toggle("bad", progress.counts.rejected > 0);
+    this.setBar(progress);
+    this.setFigures(progress);
+    this.setFinalise(progress, good);
+  }
+
+  private setBar({ counts, total }: Progress): void {
+    const parts: [string, number][] = [
+      ["fused", counts.fused], ["posed", counts.posed], ["matched", counts.matched + counts.ready + counts.received], ["rejected", counts.rejected],
+    ];
+    this.bar.setAttribute("aria-label", parts.map(([name, n]) => `${n} ${name === "matched" ? "under way" : name}`).join(", "));
+    if (!this.bar.children.length) for (const [name] of parts) this.bar.append(h("span", { class: name }));
+    parts.forEach(([, n], i) => {
+      const segment = this.bar.children[i];
+      if (segment instanceof HTMLElement) segment.style.width = total ? `${(100 * n) / total}%` : "0";
+    });
+  }
+
+  private setFigures({ rate_per_s, latency_s, revision }: Progress): void {
+    text(this.figures.rate.value, rate_per_s ? `${rate_per_s.toFixed(1)} /s` : "–");
+    text(this.figures.p50.value, latency_s ? seconds(latency_s.p50) : "–");
+    text(this.figures.p95.value, latency_s ? seconds(latency_s.p95) : "–");
+    text(this.figures.revision.value, revision ? String(revision) : "–");
+  }
+
+  private setFinalise({ state }: Progress, good: number): void {
+    this.finalise.disabled = state !== "open" || good === 0;
+    this.finalise.hidden = state === "final";
+    text(this.finaliseHint, {
+      open: good ? "Finalising solves all photos together and makes the downloads. More photos can still follow." : "",
+      finalising: "Solving all photos together and drawing the final map…",
+      final: "This map is final. Adding photos opens it again.",
+      deleting: "This mission is being deleted.",
+    }[state]);
+  }
+
+  setRejected(frames: Frame[]): void {
+    this.rejected.hidden = frames.length === 0;
+    text(this.rejectedCount, String(frames.length));
+    fill(this.rejectedList, ...frames.map((f) => h("li", {}, h("strong", {}, f.name), h("span", {}, f.reason ?? f.code ?? ""))));
+  }
+
+  setExports(exports: ExportDoc[], state: MissionState): void {
+    if (!exports.length || state === "open") {
+      fill(this.downloads, h("li", { class: "note" }, "Ready when the map is final."));
+      return;
+    }
+    fill(this.downloads, ...exports.map((doc) => this.download(doc, state)));
+  }
+
+  private download(doc: ExportDoc, state: MissionState): HTMLElement {
+    const [title, hint] = EXPORT_TITLES[doc.name] ?? [doc.name, ""];
+    const label = [h("span", { class: "name" }, title, h("small", {}, hint)), h("span", { class: "size" }, this.exportNote(doc, state))];
+    if (state !== "final" || doc.state === "failed") return h("li", {}, h("span", { class: "download off" }, ...label));
+    return h("li", {}, h("a", { class: "download", href: missionUrl(this.missionId, `/exports/${doc.name}`), download: doc.name }, ...label, icon(ICONS.download)));
+  }
+
+  private exportNote(doc: ExportDoc, state: MissionState): string {
+    if (doc.state === "failed") return doc.error ?? "failed";
+    if (state !== "final") return "waiting for the final map";
+    if (doc.state === "wanted") return "being made…";
+    return doc.size_bytes === null ? "" : bytes(doc.size_bytes);
+  }
+
+  setDrones(drones: [name: string, colour: string][]): void {
+    const now = JSON.stringify(drones);
+    if (now === this.lastDrones) return;
+    this.lastDrones = now;
+    fill(this.drones, ...drones.map(([name, colour]) => {
+      const swatch = h("i");
+      swatch.style.background = colour;
+      return h("li", {}, swatch, name);
+    }));
+  }
+
+  setUploads(note: string): void {
+    this.uploadNote.hidden = !note;
+    text(this.uploadNote, note);
+  }
+
+  setConnection(up: boolean): void {
+    this.offline.hidden = up;
+    this.root.classList.toggle("is-offline", !up);
+  }
+}
