@@ -1,0 +1,93 @@
+"""Levenberg-Marquardt on the planar-restricted pose graph; gtsam eliminates, this decides the steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from core.geometry import Array
+from core.pose_graph.elimination import Border, solve_blocks
+from core.pose_graph.priors import Priors, add_priors
+from core.pose_graph.residuals import Edges, Normal, State, linearise, retract
+
+# What a step must gain of the cost to be worth another one.
+MIN_GAIN = 1e-4
+HELD = 1e12
+
+
+@dataclass(frozen=True, slots=True)
+class Adjusted:
+    """The optimum: `state`, `squared` (M, 2) residuals in sigmas, `cost`, linearisations done."""
+
+    state: State
+    squared: Array
+    cost: float
+    steps: int
+
+
+def normal_equations(edges: Edges, priors: Priors, state: State, sigma_px: Array, scale: float) -> Normal:
+    """Matches and priors together at `state`."""
+    normal = linearise(edges, state, sigma_px, scale)
+    extra = add_priors(priors, edges.pairs, state, normal)
+    return Normal(
+        normal.frame, normal.pair, normal.cross, normal.border, normal.frame_rhs, normal.border_rhs,
+        normal.cost + extra, normal.squared,
+    )  # fmt: skip
+
+
+def adjust(
+    edges: Edges,
+    priors: Priors,
+    start: State,
+    sigma_px: Array,
+    scale: float,
+    steps: int,
+    held: NDArray[np.bool_] | None = None,
+) -> Adjusted:
+    """Minimise from `start`. `sigma_px` (C,), `scale` of the Cauchy loss in sigmas; `held` (N,) frames stay."""
+    state, damping = start, 1e-4
+    normal = normal_equations(edges, priors, state, sigma_px, scale)
+    ordering: gtsam.Ordering | None = None
+    done = 1
+    while done < steps:
+        solved = _step(edges, normal, damping, held, ordering)
+        if solved is None:
+            damping = max(damping * 10, 1e-4)
+            done += 1
+            continue
+        frames, border, ordering = solved
+        trial = retract(state, frames, border)
+        tried = normal_equations(edges, priors, trial, sigma_px, scale)
+        done += 1
+        if np.isfinite(tried.cost) and tried.cost < normal.cost:
+            gain = (normal.cost - tried.cost) / normal.cost
+            state, normal, damping = trial, tried, damping * 0.1
+            if gain < MIN_GAIN:
+                break
+        else:
+            damping = max(damping * 30, 1e-4)
+            if damping > 1e4:
+                break
+    return Adjusted(state, normal.squared, normal.cost, done)
+
+
+def _step(
+    edges: Edges,
+    normal: Normal,
+    damping: float,
+    held: NDArray[np.bool_] | None,
+    ordering: gtsam.Ordering | None,
+) -> tuple[Array, Array, gtsam.Ordering] | None:
+    diagonal = np.arange(normal.frame.shape[1])
+    frame, pair, cross, rhs = normal.frame.copy(), normal.pair, normal.cross, normal.frame_rhs
+    frame[:, diagonal, diagonal] *= 1 + damping
+    border = normal.border.copy()
+    border[np.diag_indices(len(border))] *= 1 + damping
+    if held is not None:
+        frame[held] = np.eye(len(diagonal)) * HELD
+        rhs, cross = np.where(held[:, None], 0.0, rhs), np.where(held[:, None, None], 0.0, cross)
+        pair = np.where(held[edges.pairs].any(1)[:, None, None], 0.0, pair)
+    return solve_blocks(frame, edges.pairs, pair, rhs, Border(cross, border, normal.border_rhs), ordering)

@@ -1,0 +1,82 @@
+"""What goes into the pose graph and what comes out of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from core.frame import FrameMeta
+from core.geometry import Camera, Pose, World
+
+
+@dataclass(frozen=True, slots=True)
+class GraphFrame:
+    """A photo as the pose graph sees it. `name` orders frames taken in the same second."""
+
+    frame_id: str
+    name: str
+    meta: FrameMeta
+
+
+@dataclass(frozen=True, slots=True)
+class PoseParams:
+    """How much the pose graph believes in what. Lengths in metres, angles in radians.
+
+    `points_per_edge`: correspondences kept of one image pair, spread evenly over the picture.
+    `independent_points`: how many of them count as independent, since relief errs in patches.
+    `sigma_of_f`: standard deviation of a correspondence on the ground plane, as a share of the focal length.
+    `robust_scale`: where the Cauchy loss starts to bend, in standard deviations.
+    `wrong_edge`: an edge whose median residual exceeds this many standard deviations (and this many
+    times the median edge) is taken for a wrong match.
+    """
+
+    points_per_edge: int = 48
+    independent_points: float = 16.0
+    min_points: int = 8
+    sigma_of_f: float = 1.5e-3
+    robust_scale: float = 2.0
+    wrong_edge: float = 8.0
+    gps_sigma_m: float = 3.0
+    gps_floor_m: float = 0.05
+    altitude_sigma_m: float = 15.0
+    ground_step_sigma_m: float = 3.0
+    tilt_sigma_rad: float = 0.15
+    gimbal_sigma_rad: float = 0.05
+    yaw_sigma_rad: float = 0.5
+    height_log_sigma: float = 0.4
+    focal_log_sigma: float = 0.01
+    k1_sigma: float = 0.1
+    k2_sigma: float = 0.03
+    lag_sigma_s: float = 0.3
+    assumed_height_m: float = 60.0
+    far_m: float = 50_000.0
+    oblique_ratio: float = 10.0
+    self_calibrate: bool = True
+    min_frames_to_calibrate: int = 8
+    coarse_steps: int = 6
+    fine_steps: int = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Poses of one mission at one moment.
+
+    `cameras`: refined, by `FrameMeta.camera_key`. `poses`: by frame id. `unplaced`: frame id → error code of
+    `core.errors`. `reprojection_rms_px`: over the correspondences of all trusted pairs, in pixels of the
+    original photos, wild ones (beyond ten robust standard deviations) left out. `dropped_pairs`: (low, high)
+    ids of matches that contradict the rest. `lag_s`: by drone, how long its GPS lags the shutter.
+    `yaw_offset_rad`: by drone, what to add to the metadata's yaw. `gps_sigma_m`: by drone, as observed.
+    """
+
+    world: World
+    cameras: Mapping[str, Camera]
+    poses: Mapping[str, Pose]
+    unplaced: Mapping[str, str]
+    reprojection_rms_px: float
+    dropped_pairs: tuple[tuple[str, str], ...] = ()
+    lag_s: Mapping[str, float] = field(default_factory=dict)
+    yaw_offset_rad: Mapping[str, float] = field(default_factory=dict)
+    gps_sigma_m: Mapping[str, float] = field(default_factory=dict)
+    edges: int = 0
+    observations: int = 0
+    steps: int = 0

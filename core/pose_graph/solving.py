@@ -1,0 +1,238 @@
+"""All frames and all matches at once: what a mission is finalised with, and each time its loops close."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.geometry import Array, Camera, Pose, World
+from core.matching import PairMatch
+from core.pose_graph.adjustment import Adjusted, adjust
+from core.pose_graph.fallback import gnss_poses, is_oblique
+from core.pose_graph.matchgraph import edges_of, submaps
+from core.pose_graph.model import GraphFrame, PoseParams, Solution
+from core.pose_graph.priors import Priors, gravity, heading
+from core.pose_graph.residuals import Edges, IntArray, State
+from core.pose_graph.start import Start, expected_down, starting, yaw_offsets
+from core.pose_graph.survey import Survey, survey
+
+WILD = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """Tied frames (a part of the survey, `rows` of it), their pairs, and where they ended up."""
+
+    s: Survey
+    rows: IntArray
+    edges: Edges
+    adjusted: Adjusted
+    dropped: tuple[tuple[str, str], ...]
+    gps_sigma: Array
+
+
+def solve(
+    frames: Sequence[GraphFrame],
+    matches: Sequence[PairMatch],
+    params: PoseParams | None = None,
+    world: World | None = None,
+) -> Solution:
+    """Poses of all frames from all their matches; a function of the sets, whatever their order.
+
+    `world` keeps the origin of an earlier solution. Every frame is in `poses` or in `unplaced`.
+    """
+    params = params or PoseParams()
+    s = survey(frames, params, world)
+    index = {f.frame_id: k for k, f in enumerate(s.frames) if not _looks_away(s, k)}
+    edges = edges_of(matches, index, s.cameras, s.camera, params)
+    graph = optimise(s, edges, params) if len(edges) else None
+    return _solution(s, graph, params)
+
+
+def _looks_away(s: Survey, k: int) -> bool:
+    """Whether the gimbal says that the picture is no map photo, and the gimbal is believed."""
+    down, known = expected_down(s)
+    return bool(known[k]) and bool(down[k, 2] < 0.4)
+
+
+def sigma_px(s: Survey, state: State, params: PoseParams) -> Array:
+    """Standard deviation of one correspondence (C,), pixels, by camera."""
+    return np.asarray(params.sigma_of_f * state.lens[:, 0])
+
+
+def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
+    """Start values, a coarse adjustment, wrong pairs out, and the fine one with lenses and lags free."""
+    rows = np.unique(edges.pairs)
+    tied = s.take(rows)
+    edges = replace(edges, pairs=np.searchsorted(rows, edges.pairs), camera=tied.camera)
+    names = [(f.name, f.frame_id) for f in tied.frames]
+    every, submap = edges, submaps(len(tied), edges.pairs, names)
+    start = starting(tied, edges, submap, params)
+    keep = start.edge_error < max(0.3, 6 * float(np.median(start.edge_error)))
+    edges = edges.subset(keep)
+    priors = priors_of(tied, start, submap, params)
+    sigma = params.sigma_of_f * start.state.lens[:, 0]
+    held = replace(priors, lens_sigma=np.full_like(priors.lens_sigma, 1e-6), lag_sigma_s=1e-6)
+    coarse = adjust(edges, held, start.state, sigma, 5 * params.robust_scale, params.coarse_steps)
+    good = _right_edges(edges, coarse.squared, params.wrong_edge)
+    edges = edges.subset(good)
+    priors = _learnt(tied, priors, coarse.state, params)
+    fine = adjust(edges, priors, coarse.state, sigma, params.robust_scale, params.fine_steps)
+    left = {tuple(p) for p in edges.pairs.tolist()}
+    ids = [f.frame_id for f in tied.frames]
+    dropped = tuple((ids[i], ids[j]) for i, j in every.pairs.tolist() if (i, j) not in left)
+    fine = replace(fine, steps=fine.steps + coarse.steps)
+    return Graph(tied, rows, edges, fine, dropped, priors.gps_sigma)
+
+
+def _right_edges(edges: Edges, squared: Array, limit: float) -> NDArray[np.bool_]:
+    """(E,) which pairs agree with the rest: by the median of their residuals, in sigmas."""
+    middle = np.array(
+        [np.median(squared[a:b]) for a, b in zip(edges.starts[:-1], edges.starts[1:], strict=True)]
+    )
+    residual = np.sqrt(middle)
+    return np.asarray(residual <= max(limit, 4 * float(np.median(residual))))
+
+
+def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> Priors:
+    """What is believed before the first adjustment."""
+    down, known = expected_down(s)
+    loose = ~start.held_by_gps[submap]
+    yaw = s.attitude[:, 0] + np.nan_to_num(start.yaw_offset[s.drone])
+    yaw = np.where(np.isfinite(yaw), yaw, heading(start.state.R))
+    c = len(s.cameras)
+    focal = np.where(s.focal_known, params.focal_log_sigma, 3 * params.focal_log_sigma)
+    k1 = np.full(c, params.k1_sigma)
+    k2 = np.full(c, params.k2_sigma)
+    free = params.self_calibrate & (np.bincount(s.camera, minlength=c) >= params.min_frames_to_calibrate)
+    lens_sigma = np.where(free[:, None], np.column_stack((focal, k1, k2)), 1e-6)
+    return Priors(
+        gps=s.gps,
+        gps_sigma=s.gps_sigma,
+        altitude_sigma=s.altitude_sigma,
+        velocity=s.velocity,
+        drone=s.drone,
+        anchor=start.state.t,
+        down=down,
+        tilt_sigma=np.where(known, params.gimbal_sigma_rad, 2 * params.tilt_sigma_rad),
+        yaw=np.where(loose, yaw, np.nan),
+        yaw_sigma=np.full(len(s), params.yaw_sigma_rad),
+        height=start.height,
+        height_sigma=np.where(loose, 0.1, 1.0) * np.ones(len(s)),
+        ground_step_sigma_m=params.ground_step_sigma_m,
+        lens=start.state.lens,
+        lens_sigma=lens_sigma,
+        lag_sigma_s=params.lag_sigma_s,
+    )
+
+
+def _learnt(s: Survey, priors: Priors, state: State, params: PoseParams) -> Priors:
+    """Priors after the coarse adjustment: how good each drone's GPS is, and how its camera is mounted."""
+    gps_sigma, down, tilt = priors.gps_sigma.copy(), priors.down.copy(), priors.tilt_sigma.copy()
+    seen = gravity(state.R)
+    _, known = expected_down(s)
+    miss = np.hypot(*(state.t[:, :2] - s.gps[:, :2]).T)
+    for d in range(len(s.drones)):
+        mine = (s.drone == d) & s.has_gps
+        if mine.sum() >= 10:
+            observed = float(np.median(miss[mine])) / 1.177
+            default = s.gps_sigma[mine] >= params.gps_sigma_m
+            gps_sigma[mine] = np.where(default, max(observed, 1.0), np.maximum(s.gps_sigma[mine], observed))
+        for c in np.unique(s.camera):
+            group = (s.drone == d) & (s.camera == c) & ~known
+            if group.sum() >= 5:
+                middle = np.median(seen[group], axis=0)
+                middle /= np.linalg.norm(middle)
+                off = np.linalg.norm(seen[group] - middle, axis=1)
+                down[group] = middle
+                tilt[group] = max(0.03, float(np.median(off)) / 1.177)
+    return replace(priors, gps_sigma=gps_sigma, down=down, tilt_sigma=tilt)
+
+
+def _solution(s: Survey, graph: Graph | None, params: PoseParams) -> Solution:
+    poses: dict[str, Pose] = {}
+    cameras = dict(zip(s.camera_keys, s.cameras, strict=True))
+    names = [(f.name, f.frame_id) for f in s.frames]
+    label = np.arange(len(s))
+    offset = np.full(len(s.drones), np.nan)
+    lag: dict[str, float] = {}
+    gps_sigma: dict[str, float] = {}
+    rms, steps, unplaced = 0.0, 0, {}
+    if graph is not None:
+        state = graph.adjusted.state
+        cameras = {k: refined(c, lens) for (k, c), lens in zip(cameras.items(), state.lens, strict=True)}
+        label = submaps(len(s), graph.rows[graph.edges.pairs], names)
+        poses = _visual(s, graph, label)
+        lag = {d: float(v) for d, v in zip(s.drones, state.lag_s, strict=True)}
+        offset = yaw_offsets(graph.s, heading(state.R), np.ones(len(graph.s), bool))
+        gps_sigma = {
+            d: float(np.median(graph.gps_sigma[graph.s.drone == k]))
+            for k, d in enumerate(s.drones)
+            if (graph.s.drone == k).any()
+        }
+        rms, steps = reprojection_rms(graph, params), graph.adjusted.steps
+    rest = np.array([k for k, f in enumerate(s.frames) if f.frame_id not in poses], np.int64)
+    for k, pose in gnss_poses(s, rest, poses, offset, params).items():
+        poses[s.frames[k].frame_id] = replace(pose, submap=int(label[k]))
+    for k, f in enumerate(s.frames):
+        if f.frame_id not in poses:
+            unplaced[f.frame_id] = "far_from_mission" if s.far[k] else "not_placeable"
+        elif is_oblique(poses[f.frame_id], cameras[f.meta.camera_key], params.oblique_ratio):
+            del poses[f.frame_id]
+            unplaced[f.frame_id] = "oblique"
+    return Solution(
+        world=s.world,
+        cameras=cameras,
+        poses={k: poses[k] for k in sorted(poses)},
+        unplaced=unplaced,
+        reprojection_rms_px=rms,
+        dropped_pairs=graph.dropped if graph else (),
+        lag_s=lag,
+        yaw_offset_rad={d: float(v) for d, v in zip(s.drones, offset, strict=True) if np.isfinite(v)},
+        gps_sigma_m=gps_sigma,
+        edges=len(graph.edges) if graph else 0,
+        observations=len(graph.edges.uv) if graph else 0,
+        steps=steps,
+    )
+
+
+def refined(camera: Camera, lens: Array) -> Camera:
+    """The camera with self-calibrated (f px, k1, k2)."""
+    f_px, k1, k2 = (float(v) for v in lens)
+    return replace(camera, f_px=f_px, k1=k1, k2=k2)
+
+
+def _visual(s: Survey, graph: Graph, label: IntArray) -> dict[str, Pose]:
+    """Poses of the tied frames whose submap has a place: GPS somewhere in it, or no GPS in the whole mission."""
+    state = graph.adjusted.state
+    nowhere = not s.has_gps.any()
+    size = np.bincount(label)
+    fixed = np.zeros(len(size), bool)
+    fixed[label[s.has_gps]] = True
+    poses = {}
+    for k, row in enumerate(graph.rows.tolist()):
+        sane = state.t[k, 2] - state.h[k] > 0.5 and np.isfinite(state.R[k]).all()
+        if size[label[row]] < 2 or not sane or not (fixed[label[row]] or nowhere):
+            continue
+        poses[s.frames[row].frame_id] = Pose(
+            world_R_cam=state.R[k],
+            center=state.t[k],
+            ground_h_m=float(state.h[k]),
+            source="vision-only" if nowhere else "visual",
+            submap=int(label[row]),
+        )
+    return poses
+
+
+def reprojection_rms(graph: Graph, params: PoseParams) -> float:
+    """Pixels of the original photos, over all correspondences but the wild ones."""
+    squared, edges = graph.adjusted.squared, graph.edges
+    if not len(edges.uv):
+        return 0.0
+    f = graph.adjusted.state.lens[graph.s.camera, 0] * params.sigma_of_f
+    target = np.repeat(f[edges.pairs[:, ::-1]], np.diff(edges.starts), axis=0)
+    tame = squared < (WILD * params.robust_scale) ** 2
+    return float(np.sqrt((squared * target**2)[tame].mean())) if tame.any() else 0.0

@@ -1,0 +1,150 @@
+"""Start values for every tied frame, submap by submap, whatever is known of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.geometry import Array
+from core.pose_graph.attitude import circular_mean, level_to_world, levelling, rotation_of
+from core.pose_graph.averaging import ComplexArray, Similarities, average, fit_similarity, moments
+from core.pose_graph.matchgraph import flat_rays
+from core.pose_graph.model import PoseParams
+from core.pose_graph.priors import gravity
+from core.pose_graph.residuals import Edges, IntArray, State
+from core.pose_graph.survey import Survey
+
+# GPS holds a submap's scale and heading when it knows them better than this (share, radians).
+GPS_HOLDS = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """`state` of all frames; `held_by_gps` (S,) by submap whether GPS gives it scale and heading; `height`
+    (N,) expected metres above ground; `edge_error` (E,) share of the height; `yaw_offset` by drone, NaN if
+    unknown."""
+
+    state: State
+    held_by_gps: NDArray[np.bool_]
+    height: Array
+    edge_error: Array
+    yaw_offset: Array
+
+
+def expected_down(s: Survey) -> tuple[Array, NDArray[np.bool_]]:
+    """Each camera's direction to the earth (N, 3) by its gimbal, straight ahead where that is not known (N,)."""
+    pitch, roll = s.attitude[:, 1], s.attitude[:, 2]
+    known = np.isfinite(pitch)
+    # A make that calls the straight-down view "0" would have every photo show the horizon: then nobody is believed.
+    if known.any() and np.median(pitch[known]) > -0.6:
+        known = np.zeros_like(known)
+    pitch, roll = np.where(known, pitch, -np.pi / 2), np.where(known & np.isfinite(roll), roll, 0.0)
+    return gravity(rotation_of(np.zeros(len(s)), pitch, roll)), known
+
+
+def starting(s: Survey, edges: Edges, submap: IntArray, params: PoseParams) -> Start:
+    """One linear solve for all submaps; those that GPS cannot hold get scale and heading from what is left."""
+    level = levelling(expected_down(s)[0])
+    count = int(submap.max()) + 1
+    held = np.array([_gps_holds(s, submap == k) for k in range(count)])
+    degree = np.bincount(edges.pairs.ravel(), minlength=len(s))
+    roots = [
+        int(np.flatnonzero(submap == k)[np.argmax(degree[submap == k])]) for k in range(count) if not held[k]
+    ]
+    gps = np.where(held[submap] & s.has_gps, s.gps[:, 0] + 1j * s.gps[:, 1], np.nan)
+    guess = _typical(s.relative_alt_m, params.assumed_height_m)
+    first, second = flat_rays(edges, s.cameras, level)
+    averaged = average(
+        edges.pairs, moments(first, second, edges.starts), gps, s.gps_sigma, np.array(roots, np.int64), guess
+    )
+    placed, offset = _georeferenced(s, averaged, submap, held, params)
+    height = np.abs(placed.z)
+    expected = np.ones(len(s))
+    ground = np.zeros(len(s))
+    for k in range(count):
+        mine = submap == k
+        middle = max(float(np.median(height[mine])), 1.0)
+        height[mine] = np.clip(height[mine], 0.4 * middle, 2.5 * middle)
+        expected[mine] = middle
+        altitude = s.gps[mine, 2] - height[mine]
+        if np.isfinite(altitude).any():
+            ground[mine] = np.nanmedian(altitude)
+    centre = np.column_stack((placed.c.real, placed.c.imag, ground + height))
+    lens = np.array([(c.f_px, c.k1, c.k2) for c in s.cameras])
+    R = level_to_world(-np.angle(placed.z)) @ level
+    state = State(R, centre, ground, lens, np.zeros(len(s.drones)))
+    return Start(state, held, expected, averaged.error, offset)
+
+
+def _gps_holds(s: Survey, mine: NDArray[np.bool_]) -> bool:
+    xy, sigma = s.gps[mine & s.has_gps, :2], s.gps_sigma[mine & s.has_gps]
+    if len(xy) < 2:
+        return False
+    radius = float(np.sqrt(((xy - np.median(xy, axis=0)) ** 2).sum(1).mean()))
+    return float(np.median(sigma)) < GPS_HOLDS * radius * np.sqrt(len(xy))
+
+
+def _typical(values: Array, default: float) -> float:
+    good = values[np.isfinite(values) & (values > 5.0)]
+    return float(np.median(good)) if len(good) else default
+
+
+def _georeferenced(
+    s: Survey, a: Similarities, submap: IntArray, held: NDArray[np.bool_], params: PoseParams
+) -> tuple[Similarities, Array]:
+    """Submaps brought to their place; yaw offset by drone as the submaps that GPS holds show it."""
+    z, c = a.z.copy(), a.c.copy()
+    target = s.gps[:, 0] + 1j * s.gps[:, 1]
+    for k in np.flatnonzero(held):
+        mine = submap == k
+        seen = mine & s.has_gps
+        turn, shift = fit_similarity(c[seen], target[seen], s.gps_sigma[seen])
+        z[mine], c[mine] = turn * z[mine], turn * c[mine] + shift
+    offset = yaw_offsets(s, -np.angle(z), held[submap])
+    mission = _typical(np.abs(z)[held[submap]], params.assumed_height_m)
+    east = 0.0
+    for k in np.flatnonzero(~held):
+        mine = submap == k
+        size = _typical(s.relative_alt_m[mine], mission) / max(float(np.median(np.abs(z[mine]))), 1e-6)
+        turn = size * np.exp(-1j * _turn(s, z, c, offset, mine))
+        z[mine], c[mine] = turn * z[mine], turn * c[mine]
+        seen = mine & s.has_gps
+        if seen.any():
+            miss = target[seen] - c[seen]
+            c[mine] += np.median(miss.real) + 1j * np.median(miss.imag)
+        else:
+            # nothing says where it lies: side by side, so that no two islands cover each other
+            reach = 2.0 * float(np.median(np.abs(z[mine])))
+            c[mine] += east - c[mine].real.min() - 1j * np.median(c[mine].imag)
+            east = float(c[mine].real.max()) + reach
+    return Similarities(z, c, a.error), offset
+
+
+def yaw_offsets(s: Survey, yaw: Array, trusted: NDArray[np.bool_]) -> Array:
+    """By drone, what to add to the metadata's yaw to get the picture's (D,), NaN where frames do not agree."""
+    offset = np.full(len(s.drones), np.nan)
+    usable = trusted & np.isfinite(s.attitude[:, 0])
+    for d in range(len(s.drones)):
+        mine = usable & (s.drone == d)
+        if mine.sum() >= 3:
+            mean, agreement = circular_mean(yaw[mine] - s.attitude[mine, 0])
+            offset[d] = mean if agreement > 0.8 else np.nan
+    return offset
+
+
+def _turn(s: Survey, z: ComplexArray, c: ComplexArray, offset: Array, mine: NDArray[np.bool_]) -> float:
+    """Clockwise turn of a submap that makes its headings those of the metadata, or its track that of GPS."""
+    compass = mine & np.isfinite(s.attitude[:, 0])
+    if compass.any():
+        expected = s.attitude[compass, 0] + np.nan_to_num(offset[s.drone[compass]])
+        mean, agreement = circular_mean(expected + np.angle(z[compass]))
+        if agreement > 0.5:
+            return mean
+    seen = mine & s.has_gps
+    if seen.sum() >= 2:
+        turn, _ = fit_similarity(c[seen], (s.gps[:, 0] + 1j * s.gps[:, 1])[seen], s.gps_sigma[seen])
+        return -float(np.angle(turn))
+    first = min(np.flatnonzero(mine).tolist(), key=lambda k: (s.frames[k].name, s.frames[k].frame_id))
+    return float(np.angle(z[first]))
