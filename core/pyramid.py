@@ -45,8 +45,10 @@ def halve(rgba: Rgba) -> Rgba:
     premultiplied = rgba.astype(np.float32)
     premultiplied[..., :3] *= alpha[..., None]
     mean = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)
-    mean[..., :3] /= np.maximum(mean[..., 3:], 0.25)
-    return np.asarray(mean + np.float32(0.5), np.uint8)
+    colour = mean[..., :3] / np.maximum(mean[..., 3:], np.float32(0.25))
+    return np.concatenate((colour + np.float32(0.5), mean[..., 3:] + np.float32(0.5)), axis=2).astype(
+        np.uint8
+    )
 
 
 def encode(rgba: Rgba, quality: int = QUALITY) -> tuple[bytes, str] | None:

@@ -1,0 +1,255 @@
+"""Drawing the mosaic: the pixels of a raster as a pure function of frames, poses and photos (Zhao 2020, 3.4).
+
+Which photo shows which ground is decided on a coarse lattice, so that only photos that win somewhere are read
+and warped, and only where they win. Everything is anchored to the raster's absolute pixels: neighbouring tiles
+rendered apart are equal, to the last bit, to the same tiles cut from one large block.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.blend import NOBODY, Labels, Layer, blend_finest, blend_level, gaussian_levels, label_level
+from core.geometry import Array, PosedFrame, World
+from core.grid import Grid
+from core.warp import Int32, Lattice, Rgb, View, knots, look, warp
+
+PAD_CELLS = 2
+"""The pyramid looks this many cells beyond a pixel, however many bands there are."""
+SKIRT_CELLS = 2
+"""So far beyond a photo's edge its colour still counts a little, lest tone jump at the mosaic's border."""
+
+
+class Photos(Protocol):
+    """Where pixels come from; both must return the same pixels whenever they are asked."""
+
+    def photo(self, frame_id: str) -> Rgb:
+        """The photo at the mission's resolution, (h, w, 3) uint8 RGB, C-contiguous."""
+        ...
+
+    def thumb(self, frame_id: str) -> Rgb:
+        """The whole photo at about 128 px, area-averaged, (h, w, 3) uint8 RGB."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class FusionParams:
+    """What the look of the mosaic depends on.
+
+    `bands`: Laplacian bands above the lowest; cells are 2^bands pixels. `tone_side_px`: photos are shrunk to
+    this before their tones are averaged, the coarser the fewer ghosts. `max_view_deg`: rays flatter than this
+    from the vertical are not drawn. `gnss_importance`: weight of frames without a visual pose.
+    """
+
+    bands: int = 4
+    tone_side_px: int = 32
+    max_view_deg: float = 75.0
+    gnss_importance: float = 0.25
+    sampling: Literal["linear", "cubic"] = "linear"
+
+    @property
+    def cell_px(self) -> int:
+        """The side of a lattice cell."""
+        return 1 << self.bands
+
+    @property
+    def reach_px(self) -> int:
+        """No frame changes a pixel farther than this outside of its footprint: the margin for dirty tiles."""
+        return (PAD_CELLS + SKIRT_CELLS + 1) * self.cell_px
+
+
+DEFAULT = FusionParams()
+
+
+class FrameIndex:
+    """Posed frames with the boxes of their footprints, to find quickly those that a raster needs."""
+
+    def __init__(self, frames: Iterable[PosedFrame], params: FusionParams = DEFAULT) -> None:
+        self.frames: tuple[PosedFrame, ...] = tuple(sorted(frames, key=lambda f: f.frame_id))
+        boxes = [_box(frame, params.max_view_deg) for frame in self.frames]
+        self._boxes = np.array(boxes, float).reshape(-1, 5)
+        self._reach_px = params.reach_px
+
+    def overlapping(self, grid: Grid, world: World) -> list[PosedFrame]:
+        """The frames that may change a pixel of the grid, by ascending id."""
+        if not self.frames:
+            return []
+        cols = np.array([0, grid.width, grid.width, 0]) + grid.col0 - 0.5
+        rows = np.array([0, 0, grid.height, grid.height]) + grid.row0 - 0.5
+        lines = grid.columns(world, cols, rows)
+        heights = self._boxes[:, 4]
+        ends = np.array([lines.at(h) for h in (heights.min(), heights.max())]).reshape(-1, 2)
+        margin = 1.1 * self._reach_px * grid.resolution_m(world)
+        low, high = ends.min(0) - margin, ends.max(0) + margin
+        hit = (self._boxes[:, :2] <= high).all(1) & (self._boxes[:, 2:4] >= low).all(1)
+        return [self.frames[k] for k in np.flatnonzero(hit)]
+
+
+def overlapping(
+    grid: Grid, world: World, frames: Iterable[PosedFrame], params: FusionParams = DEFAULT
+) -> list[PosedFrame]:
+    """The frames that may change a pixel of the grid, by ascending id; for many grids keep a `FrameIndex`."""
+    return FrameIndex(frames, params).overlapping(grid, world)
+
+
+def render(
+    grid: Grid, world: World, frames: Sequence[PosedFrame], photos: Photos, params: FusionParams = DEFAULT
+) -> NDArray[np.uint8]:
+    """The mosaic on a grid: RGBA (height, width, 4) uint8, alpha 0 where no frame sees the ground.
+
+    `frames`: at least those of `overlapping`; their order does not matter. Pure: equal input, equal bytes.
+    """
+    out = np.zeros((grid.height, grid.width, 4), np.uint8)
+    frames = overlapping(grid, world, frames, params)
+    lattice = Lattice.covering(grid, world, params.cell_px, PAD_CELLS)
+    scene = _Scene.of(lattice, grid.resolution_m(world), frames, photos, params)
+    if scene is None:
+        return out
+    drawn = _draw(scene, lattice, grid.resolution_m(world), photos, params)
+    top, left = grid.row0 - lattice.row0, grid.col0 - lattice.col0
+    out[:] = drawn[top : top + grid.height, left : left + grid.width]
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """Who wins where on a lattice. `frames`: the winners only, `labels` and `weights` index into them."""
+
+    frames: list[PosedFrame]
+    labels: Labels
+    weights: Int32
+    retone: NDArray[np.int16]
+
+    @classmethod
+    def of(
+        cls,
+        lattice: Lattice,
+        resolution_m: float,
+        frames: Sequence[PosedFrame],
+        photos: Photos,
+        params: FusionParams,
+    ) -> _Scene | None:
+        """The winners among frames by ascending id (ties go to the lower); None when nobody sees it."""
+        views = [_view(lattice, resolution_m, frame, photos, params) for frame in frames]
+        seen = [k for k, view in enumerate(views) if view.weight.any()]
+        if not seen:
+            return None
+        weights = np.stack([views[k].weight for k in seen])
+        labels = np.where(weights.any(0), weights.argmax(0), NOBODY)
+        total, mean = np.zeros(labels.shape, np.int64), np.zeros((*labels.shape, 3), np.int64)
+        for k in seen:
+            total += views[k].weight
+            mean += views[k].weight[..., None].astype(np.int64) * views[k].tone
+        mean = (mean + total[..., None] // 2) // np.maximum(total, 1)[..., None]
+        winners = np.unique(labels[labels != NOBODY])
+        place = np.full(len(seen) + 1, NOBODY, np.int16)
+        place[winners] = np.arange(len(winners))
+        own = np.zeros_like(mean)
+        for k in winners:
+            own[labels == k] = views[seen[k]].tone[labels == k]
+        return cls(
+            frames=[frames[seen[k]] for k in winners],
+            labels=place[labels],
+            weights=np.ascontiguousarray(weights[winners]),
+            retone=(mean - own).astype(np.int16),
+        )
+
+
+def _view(
+    lattice: Lattice, resolution_m: float, frame: PosedFrame, photos: Photos, params: FusionParams
+) -> View:
+    gsd_m = abs(frame.pose.gsd_m(frame.camera))
+    importance = min(1.0, resolution_m / gsd_m)
+    if frame.pose.source == "gnss":
+        importance *= params.gnss_importance
+    skirt_px = SKIRT_CELLS * params.cell_px * resolution_m / gsd_m
+    tone = _shrunk(photos.thumb(frame.frame_id), params.tone_side_px)
+    return look(lattice, frame, tone, importance, math.cos(math.radians(params.max_view_deg)), skirt_px)
+
+
+def _shrunk(image: Rgb, side_px: int) -> Rgb:
+    scale = min(1.0, side_px / max(image.shape[:2]))
+    size = (max(2, round(image.shape[1] * scale)), max(2, round(image.shape[0] * scale)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _draw(
+    scene: _Scene, lattice: Lattice, resolution_m: float, photos: Photos, params: FusionParams
+) -> NDArray[np.uint8]:
+    layers, places, sizes = [], np.empty((*scene.weights.shape, 2), np.int32), []
+    for k, frame in enumerate(scene.frames):
+        photo = _at_scale(photos.photo(frame.frame_id), frame, resolution_m)
+        camera = frame.camera.scaled(photo.shape[1], photo.shape[0])
+        places[k] = knots(lattice, frame, camera, math.cos(math.radians(params.max_view_deg)))
+        sizes.append((photo.shape[1], photo.shape[0]))
+        layers.append(_layer(k, frame, photo, scene.labels, places[k], params))
+    return _blend(scene, layers, places, np.array(sizes, np.int32), params)
+
+
+def _at_scale(photo: Rgb, frame: PosedFrame, resolution_m: float) -> Rgb:
+    """The photo, halved until its pixels are less than twice as fine as the raster's, lest it alias."""
+    gsd_m = abs(frame.pose.gsd_m(frame.camera)) * frame.camera.width / photo.shape[1]
+    factor = 1 << max(0, math.floor(math.log2(resolution_m / gsd_m)))
+    if factor == 1:
+        return photo
+    size = (max(2, photo.shape[1] // factor), max(2, photo.shape[0] // factor))
+    return np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _layer(
+    label: int, frame: PosedFrame, photo: Rgb, labels: Labels, places: Int32, params: FusionParams
+) -> Layer:
+    """Warp a winner where it wins, and two cells around, as far as the blending of its pixels looks."""
+    own = (labels == label).astype(np.uint8)
+    needed = cv2.dilate(own, np.ones((5, 5), np.uint8)).astype(bool)
+    rows, cols = np.flatnonzero(needed.any(1)), np.flatnonzero(needed.any(0))
+    top, bottom, left, right = rows[0], rows[-1] + 1, cols[0], cols[-1] + 1
+    # One knot more all round; at the lattice's own edge the last knot is repeated, pixels there are not used.
+    around = np.pad(places, ((1, 1), (1, 1), (0, 0)), mode="edge")[top : bottom + 2, left : right + 2]
+    warped = warp(
+        photo,
+        np.ascontiguousarray(around),
+        needed[top:bottom, left:right],
+        params.cell_px,
+        params.sampling == "cubic",
+    )
+    gain = np.array([round(4096 * g) for g in frame.gain], np.int32)
+    return Layer(label, int(top), int(left), gaussian_levels(warped, params.bands), gain)
+
+
+def _blend(
+    scene: _Scene, layers: list[Layer], places: Int32, sizes: Int32, params: FusionParams
+) -> NDArray[np.uint8]:
+    labels, colours = scene.labels, scene.retone.copy()
+    for layer in layers:
+        mine = scene.labels == layer.label
+        mean = layer.levels[-1]
+        window = np.zeros((*labels.shape, 3), np.int32)
+        window[layer.row :, layer.col :][: mean.shape[0], : mean.shape[1]] = (mean * layer.gain + 128) >> 8
+        colours[mine] += window[mine].astype(np.int16)
+    for level in range(params.bands - 1, 0, -1):
+        finer = label_level(scene.labels, scene.weights, params.cell_px >> level, None, sizes)
+        colours = blend_level(colours, labels, layers, level, finer, params.cell_px)
+        labels = finer
+    finest = label_level(scene.labels, scene.weights, params.cell_px, places, sizes)
+    return blend_finest(colours, labels, layers, finest, params.cell_px)
+
+
+def _box(frame: PosedFrame, max_view_deg: float) -> tuple[float, float, float, float, float]:
+    """West, south, east, north (world metres) of what the frame can show, and its ground height."""
+    camera, pose = frame.camera, frame.pose
+    xs, ys = np.meshgrid(np.linspace(0, camera.width - 1, 5), np.linspace(0, camera.height - 1, 5))
+    rays: Array = camera.rays(np.column_stack((xs.ravel(), ys.ravel()))) @ pose.world_R_cam.T
+    flat = np.hypot(rays[:, 0], rays[:, 1])
+    steep = np.maximum(-rays[:, 2], flat / math.tan(math.radians(max_view_deg)))
+    ground = pose.center[:2] + rays[:, :2] * ((pose.center[2] - pose.ground_h_m) / steep)[:, None]
+    west, south = ground.min(0)
+    east, north = ground.max(0)
+    return (float(west), float(south), float(east), float(north), pose.ground_h_m)

@@ -1,0 +1,283 @@
+"""From the coarse lattice of a raster to the pixels of a photo.
+
+A lattice has one knot at the centre of each square cell of `cell_px` pixels, at absolute places of the
+raster's pixel plane. Frames are projected exactly, distortion included, at knots only; between knots the map is
+bilinear in fixed point, so that a pixel's value does not depend on the window that it is computed in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ParamSpec, TypeVar, cast
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from core.geometry import Camera, PosedFrame, World
+from core.grid import Columns, Grid
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Int32 = NDArray[np.int32]
+Rgb = NDArray[np.uint8]
+
+KNOT_BITS = 8
+"""Knots hold photo coordinates in 1/256 px."""
+INSIDE = 256
+"""A knot's weight from here on means that it lies inside of the photo; below, that it is near it."""
+FULL = 65535
+"""The weight of a photo's centre seen straight down."""
+
+
+def compiled(function: Callable[P, T]) -> Callable[P, T]:
+    """`numba.njit` without the GIL, kept on disk, and known to the type checker."""
+    return cast(Callable[P, T], numba.njit(cache=True, nogil=True)(function))
+
+
+@dataclass(frozen=True, slots=True)
+class Lattice:
+    """`rows` × `cols` knots; cell (0, 0) begins at absolute pixel (col0, row0), a multiple of `cell_px`."""
+
+    col0: int
+    row0: int
+    cols: int
+    rows: int
+    cell_px: int
+    columns: Columns
+
+    @classmethod
+    def covering(cls, grid: Grid, world: World, cell_px: int, pad: int) -> Lattice:
+        """The knots of every cell that the grid touches, and of `pad` cells more on each side."""
+        left, top = grid.col0 // cell_px - pad, grid.row0 // cell_px - pad
+        cols = -(-(grid.col0 + grid.width) // cell_px) + pad - left
+        rows = -(-(grid.row0 + grid.height) // cell_px) + pad - top
+        centre = (cell_px - 1) / 2
+        x, y = np.meshgrid(
+            (left + np.arange(cols)) * float(cell_px) + centre,
+            (top + np.arange(rows)) * float(cell_px) + centre,
+        )
+        columns = grid.columns(world, x.ravel(), y.ravel())
+        return cls(left * cell_px, top * cell_px, cols, rows, cell_px, columns)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One frame seen from the lattice.
+
+    `weight`: (rows, cols) int32, 0 where the frame has no say, `INSIDE` … `FULL` inside of its photo.
+    `tone`: (rows, cols, 3) int32, the photo's local mean colour in 1/16 grey levels, gain applied.
+    """
+
+    weight: Int32
+    tone: Int32
+
+
+def intrinsics(camera: Camera) -> NDArray[np.float64]:
+    """What the kernels need: f, cx, cy, k1, k2, the largest useful radius², width, height (float64)."""
+    corner = max(math.hypot(*ray) for ray in camera.rays(camera.corners())[:, :2])
+    # Beyond the corners a polynomial may fold back into the picture: the factor is frozen from there on.
+    return np.array(
+        [
+            camera.f_px,
+            camera.cx,
+            camera.cy,
+            camera.k1,
+            camera.k2,
+            (1.02 * corner) ** 2,
+            camera.width,
+            camera.height,
+        ]
+    )
+
+
+def look(
+    lattice: Lattice, frame: PosedFrame, tone: Rgb, importance: float, min_cos_view: float, skirt_px: float
+) -> View:
+    """Weights and tones of one frame at all knots.
+
+    `tone`: the photo shrunk to a few pixels, (h, w, 3) uint8. `importance`: 0 … 1, multiplies the weight.
+    `skirt_px`: how far beyond the photo's edge (pixels of the original) weights fade out.
+    """
+    weight = np.zeros((lattice.rows, lattice.cols), np.int32)
+    colour = np.zeros((lattice.rows, lattice.cols, 3), np.int32)
+    pose = frame.pose
+    _look(
+        lattice.columns.foot,
+        lattice.columns.slope,
+        np.ascontiguousarray(pose.world_R_cam, np.float64),
+        np.asarray(pose.center, np.float64),
+        float(pose.ground_h_m),
+        intrinsics(frame.camera),
+        tone,
+        np.array([round(16 * 256 * g) for g in frame.gain], np.int64),
+        importance,
+        min_cos_view,
+        skirt_px,
+        weight.reshape(-1),
+        colour.reshape(-1, 3),
+    )
+    return View(weight, colour)
+
+
+def knots(lattice: Lattice, frame: PosedFrame, camera: Camera, min_cos_view: float) -> Int32:
+    """Where the knots fall in the photo: (rows, cols, 2) int32 x, y in 1/256 px of `camera`'s size."""
+    out = np.empty((lattice.rows, lattice.cols, 2), np.int32)
+    pose = frame.pose
+    _knots(
+        lattice.columns.foot,
+        lattice.columns.slope,
+        np.ascontiguousarray(pose.world_R_cam, np.float64),
+        np.asarray(pose.center, np.float64),
+        float(pose.ground_h_m),
+        intrinsics(camera),
+        min_cos_view,
+        out.reshape(-1, 2),
+    )
+    return out
+
+
+def warp(photo: Rgb, lattice_knots: Int32, needed: NDArray[np.bool_], cell_px: int, cubic: bool) -> Rgb:
+    """A photo drawn onto the cells of a lattice.
+
+    `lattice_knots`: (r + 2, c + 2, 2), with one knot around the (r, c) cells `needed`. Returns (r · cell_px,
+    c · cell_px, 3) uint8; cells not needed may hold anything.
+    """
+    rows, cols = needed.shape
+    out = np.empty((rows * cell_px, cols * cell_px, 3), np.uint8)
+    method = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
+    step = max(1, 64 // cell_px)
+    for top in range(0, rows, step):
+        bottom = min(top + step, rows)
+        wanted = np.flatnonzero(needed[top:bottom].any(0))
+        if len(wanted) == 0:
+            continue
+        left, right = int(wanted[0]), int(wanted[-1]) + 1
+        shape = ((bottom - top) * cell_px, (right - left) * cell_px)
+        xy, fraction = np.empty((*shape, 2), np.int16), np.empty(shape, np.uint16)
+        _fine_maps(lattice_knots[top : bottom + 2, left : right + 2], cell_px, xy, fraction)
+        view = out[top * cell_px : bottom * cell_px, left * cell_px : right * cell_px]
+        view[:] = cv2.remap(photo, xy, fraction, method, borderMode=cv2.BORDER_REFLECT)
+    return out
+
+
+@compiled
+def _project(
+    x: float,
+    y: float,
+    h_m: float,
+    world_R_cam: NDArray[np.float64],
+    center: NDArray[np.float64],
+    lens: NDArray[np.float64],
+) -> tuple[float, float, float]:
+    """A ground point → its pixel and the cosine of the view angle (≤ 0 behind the camera)."""
+    dx, dy, dz = x - center[0], y - center[1], h_m - center[2]
+    a = world_R_cam[0, 0] * dx + world_R_cam[1, 0] * dy + world_R_cam[2, 0] * dz
+    b = world_R_cam[0, 1] * dx + world_R_cam[1, 1] * dy + world_R_cam[2, 1] * dz
+    c = world_R_cam[0, 2] * dx + world_R_cam[1, 2] * dy + world_R_cam[2, 2] * dz
+    if c <= 1e-6:
+        return 0.0, 0.0, -1.0
+    cos_view = -dz / math.sqrt(dx * dx + dy * dy + dz * dz)
+    a, b = a / c, b / c
+    r2 = min(a * a + b * b, lens[5])
+    stretch = (1 + lens[3] * r2 + lens[4] * r2 * r2) * lens[0]
+    return a * stretch + lens[1], b * stretch + lens[2], cos_view
+
+
+@compiled
+def _knots(
+    foot: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    world_R_cam: NDArray[np.float64],
+    center: NDArray[np.float64],
+    h_m: float,
+    lens: NDArray[np.float64],
+    min_cos_view: float,
+    out: Int32,
+) -> None:
+    limit_x, limit_y = min(2 * lens[6], 32000.0), min(2 * lens[7], 32000.0)
+    for k in range(foot.shape[0]):
+        u, v, cos_view = _project(
+            foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m, h_m, world_R_cam, center, lens
+        )
+        if cos_view < min_cos_view:
+            u, v = -lens[6], -lens[7]
+        out[k, 0] = math.floor(min(max(u, -lens[6]), limit_x) * 256 + 0.5)
+        out[k, 1] = math.floor(min(max(v, -lens[7]), limit_y) * 256 + 0.5)
+
+
+@compiled
+def _look(
+    foot: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    world_R_cam: NDArray[np.float64],
+    center: NDArray[np.float64],
+    h_m: float,
+    lens: NDArray[np.float64],
+    tone: Rgb,
+    gain: NDArray[np.int64],
+    importance: float,
+    min_cos_view: float,
+    skirt_px: float,
+    weight: Int32,
+    colour: Int32,
+) -> None:
+    width, height = lens[6], lens[7]
+    for k in range(foot.shape[0]):
+        u, v, cos_view = _project(
+            foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m, h_m, world_R_cam, center, lens
+        )
+        beyond = max(max(-u, u - (width - 1)), max(-v, v - (height - 1)))
+        if cos_view < min_cos_view or beyond >= skirt_px:
+            continue
+        if beyond > 0:
+            weight[k] = int((INSIDE - 1) * (1 - beyond / skirt_px))
+        else:
+            across, along = 2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1
+            value = (1 - across * across) * (1 - along * along) * cos_view * cos_view * cos_view * cos_view
+            weight[k] = INSIDE + int((FULL - INSIDE) * importance * value)
+        tx = min(max((u + 0.5) * tone.shape[1] / width - 0.5, 0.0), tone.shape[1] - 1.0)
+        ty = min(max((v + 0.5) * tone.shape[0] / height - 0.5, 0.0), tone.shape[0] - 1.0)
+        x0, y0 = min(int(tx), tone.shape[1] - 2), min(int(ty), tone.shape[0] - 2)
+        fx, fy = int((tx - x0) * 256 + 0.5), int((ty - y0) * 256 + 0.5)
+        for c in range(3):
+            upper = int(tone[y0, x0, c]) * (256 - fx) + int(tone[y0, x0 + 1, c]) * fx
+            lower = int(tone[y0 + 1, x0, c]) * (256 - fx) + int(tone[y0 + 1, x0 + 1, c]) * fx
+            mean = upper * (256 - fy) + lower * fy
+            colour[k, c] = (mean * gain[c] + (1 << 23)) >> 24
+
+
+@compiled
+def _fine_maps(
+    lattice_knots: Int32, cell_px: int, xy: NDArray[np.int16], fraction: NDArray[np.uint16]
+) -> None:
+    """Bilinear between knots, all in integers; the last 5 bits go to `fraction` as cv2.remap wants them."""
+    half, cols = cell_px // 2, lattice_knots.shape[1]
+    shift = 1
+    while (1 << shift) < 2 * cell_px:
+        shift += 1
+    row_x, row_y = np.empty(cols, np.int32), np.empty(cols, np.int32)
+    line_x, line_y = np.empty(cols * cell_px, np.int32), np.empty(cols * cell_px, np.int32)
+    down = shift + KNOT_BITS - 5
+    rounding = np.int32(1 << (down - 1))
+    for y in range(xy.shape[0]):
+        k = (y + half) // cell_px
+        part = np.int32(2 * (y + half - k * cell_px) + 1)
+        for j in range(cols):
+            for row, axis in ((row_x, 0), (row_y, 1)):
+                upper, lower = lattice_knots[k, j, axis], lattice_knots[k + 1, j, axis]
+                row[j] = upper + (((lower - upper) * part + cell_px) >> shift)
+        for line, row in ((line_x, row_x), (line_y, row_y)):
+            for j in range(cols - 1):
+                start = (np.int32(row[j]) << shift) + rounding
+                slope = row[j + 1] - row[j]
+                for i in range(cell_px):
+                    line[j * cell_px + i] = (start + slope * np.int32(2 * i + 1)) >> down
+        for x in range(xy.shape[1]):
+            qx, qy = line_x[x + half], line_y[x + half]
+            xy[y, x, 0] = qx >> 5
+            xy[y, x, 1] = qy >> 5
+            fraction[y, x] = ((qy & 31) << 5) | (qx & 31)
