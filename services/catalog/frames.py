@@ -1,0 +1,327 @@
+"""Frames: received → ready → matched → posed → fused, or rejected with a reason. Never backwards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, and_, func, or_, select, tuple_, update
+from sqlalchemy.orm import InstrumentedAttribute, Session
+
+from core.errors import OrthostreamError
+from core.frame import FrameMeta
+from services.catalog import events
+from services.catalog.rows import chunks, clock, insert, lock
+from services.catalog.wakes import Wake
+from services.errors import FrameNotFound
+from services.tables import Frame, Mission
+
+STATES = ("received", "ready", "matched", "posed", "fused", "rejected")
+_WAKES_AT_ONCE = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A frame that was read: what neighbours are found by, besides its features."""
+
+    frame_id: str
+    name: str
+    state: str
+    meta: FrameMeta
+
+
+def receive(
+    tx: Session,
+    mission_id: str,
+    frame_id: str,
+    name: str,
+    size_bytes: int,
+    media_type: str,
+    width: int,
+    height: int,
+    telemetry: Mapping[str, Any] | None = None,
+    now: float | None = None,
+) -> tuple[Frame, bool]:
+    """The frame's row, and whether it is new. A new one opens a final mission again.
+
+    Raises MissionNotFound. Put the photo's bytes into the store before this transaction commits.
+    """
+    now = clock(now)
+    mission = lock(tx, mission_id)
+    created = _insert(
+        tx,
+        mission_id=mission_id,
+        id=frame_id,
+        name=_clean(name),
+        size_bytes=size_bytes,
+        media_type=media_type,
+        width=width,
+        height=height,
+        state="received",
+        telemetry=dict(telemetry) if telemetry else None,
+        received_at=now,
+        attempts=0,
+    )
+    if created:
+        _reopen(tx, mission, now)
+        events.append_frames(tx, mission_id, "received", [frame_id], now)
+    return get(tx, mission_id, frame_id), created
+
+
+def record_rejected_upload(
+    tx: Session,
+    mission_id: str,
+    frame_id: str,
+    name: str,
+    size_bytes: int,
+    error: OrthostreamError,
+    now: float | None = None,
+) -> Frame:
+    """Remember an upload that was refused before it was stored, with the reason its uploader was told."""
+    now = clock(now)
+    lock(tx, mission_id)
+    created = _insert(
+        tx,
+        mission_id=mission_id,
+        id=frame_id,
+        name=_clean(name),
+        size_bytes=size_bytes,
+        state="rejected",
+        reason_code=error.code,
+        reason=str(error),
+        received_at=now,
+        attempts=0,
+    )
+    if created:
+        events.append_frames(tx, mission_id, "rejected", [frame_id], now, code=error.code)
+    return get(tx, mission_id, frame_id)
+
+
+def begin(tx: Session, mission_id: str, frame_id: str) -> int:
+    """Count one more attempt at reading the photo; the number of attempts so far, this one included.
+
+    A photo that kills its reader is found again and again: whoever sees the number grow rejects it.
+    """
+    lock(tx, mission_id)
+    count = tx.scalar(
+        update(Frame)
+        .where(Frame.mission_id == mission_id, Frame.id == frame_id)
+        .values(attempts=Frame.attempts + 1)
+        .returning(Frame.attempts)
+        .execution_options(synchronize_session=False)
+    )
+    if count is None:
+        raise FrameNotFound(f"Mission {mission_id!r} has no frame {frame_id!r}.")
+    return count
+
+
+def mark_ready(
+    tx: Session, mission_id: str, frame_id: str, meta: FrameMeta, now: float | None = None
+) -> bool:
+    """Received → ready with what was read. False, and nothing written, when it had come further already."""
+    values = {"meta": meta.to_json(), "ready_at": clock(now)}
+    return _advance(tx, mission_id, frame_id, "received", "ready", values, now)
+
+
+def mark_matched(tx: Session, mission_id: str, frame_id: str, now: float | None = None) -> bool:
+    """Ready → matched, in the transaction that records its last pairs. False when it was already."""
+    return _advance(tx, mission_id, frame_id, "ready", "matched", {"matched_at": clock(now)}, now)
+
+
+def mark_rejected(
+    tx: Session, mission_id: str, frame_id: str, code: str, reason: str, now: float | None = None
+) -> bool:
+    """Received or ready → rejected, because the photo itself is no good. False when that was decided."""
+    now = clock(now)
+    lock(tx, mission_id)
+    changed = _set(
+        tx,
+        mission_id,
+        [frame_id],
+        ("received", "ready"),
+        {"state": "rejected", "reason_code": code, "reason": _clean(reason)},
+    )
+    events.append_frames(tx, mission_id, "rejected", changed, now, code=code)
+    return bool(changed)
+
+
+def mark_posed(
+    tx: Session, mission_id: str, frame_ids: Iterable[str], now: float | None = None
+) -> Sequence[str]:
+    """Matched → posed; so is one that could not be placed before. The ids that changed."""
+    now = clock(now)
+    lock(tx, mission_id)
+    values = {"state": "posed", "posed_at": now, "reason_code": None, "reason": None}
+    changed = _set(tx, mission_id, sorted(frame_ids), ("matched",), values, or_unplaced=True)
+    events.append_frames(tx, mission_id, "posed", changed, now)
+    return changed
+
+
+def mark_unplaced(
+    tx: Session, mission_id: str, reasons: Mapping[str, tuple[str, str]], now: float | None = None
+) -> Sequence[str]:
+    """matched, posed or fused → rejected by the pose graph: {frame_id: (code, reason)}. The ids that changed.
+
+    Such a frame stays among `sightings`: more photos may tie it in after all.
+    """
+    now = clock(now)
+    lock(tx, mission_id)
+    changed: Sequence[str] = []
+    for code, reason in sorted(set(reasons.values())):
+        ids = sorted(f for f, why in reasons.items() if why == (code, reason))
+        values = {"state": "rejected", "reason_code": code, "reason": _clean(reason)}
+        some = _set(tx, mission_id, ids, ("matched", "posed", "fused"), values)
+        events.append_frames(tx, mission_id, "rejected", some, now, code=code)
+        changed = [*changed, *some]
+    return changed
+
+
+def get(tx: Session, mission_id: str, frame_id: str) -> Frame:
+    """The frame's row as it is now; raises FrameNotFound."""
+    row = tx.get(Frame, (mission_id, frame_id), populate_existing=True)
+    if row is None:
+        raise FrameNotFound(f"Mission {mission_id!r} has no frame {frame_id!r}.")
+    return row
+
+
+def list(
+    tx: Session, mission_id: str, state: str | None = None, limit: int = 1000, after: str | None = None
+) -> Sequence[Frame]:
+    """Frames in the order of their arrival, from the one after frame `after` on, at most `limit`."""
+    query = select(Frame).where(Frame.mission_id == mission_id)
+    if state is not None:
+        query = query.where(Frame.state == state)
+    if after is not None:
+        last = get(tx, mission_id, after)
+        query = query.where(tuple_(Frame.received_at, Frame.id) > tuple_(last.received_at, last.id))
+    return tx.scalars(query.order_by(Frame.received_at, Frame.id).limit(limit)).all()
+
+
+def sightings(tx: Session, mission_id: str) -> Sequence[Seen]:
+    """Every frame that could be read, by id: also those that the pose graph could not place yet."""
+    query = (
+        select(Frame.id, Frame.name, Frame.state, Frame.meta)
+        .where(Frame.mission_id == mission_id, Frame.meta.is_not(None))
+        .where(or_(Frame.state != "rejected", Frame.matched_at.is_not(None)))
+        .order_by(Frame.id)
+    )
+    return [
+        Seen(i, name, state, FrameMeta.from_json(meta or {})) for i, name, state, meta in tx.execute(query)
+    ]
+
+
+def latencies_s(tx: Session, mission_id: str) -> Sequence[float]:
+    """Seconds from upload to visible tile of every fused frame, in no order."""
+    query = select(Frame.fused_at, Frame.received_at).where(
+        Frame.mission_id == mission_id, Frame.fused_at.is_not(None)
+    )
+    return [fused - received for fused, received in tx.execute(query) if fused is not None]
+
+
+def stalled(tx: Session, older_than_s: float, now: float | None = None) -> Sequence[Wake]:
+    """Whom to wake for the frames that stood still, stamped so that nobody else wakes them as well."""
+    now = clock(now)
+    stages = (
+        ("received", "ingest", Frame.received_at, Frame.ready_at),
+        ("ready", "match", Frame.ready_at, Frame.matched_at),
+    )
+    wakes = [
+        Wake(task, key)
+        for state, task, entered, left in stages
+        for key in _overdue(tx, state, entered, left, older_than_s, now)
+    ]
+    waiting = _overdue(tx, "matched", Frame.matched_at, None, older_than_s, now)
+    return [*wakes, *(Wake("sequence", (mission_id,)) for mission_id in sorted({m for m, _ in waiting}))]
+
+
+def _overdue(
+    tx: Session,
+    state: str,
+    entered: InstrumentedAttribute[Any],
+    left: InstrumentedAttribute[Any] | None,
+    older_than_s: float,
+    now: float,
+) -> Sequence[tuple[str, str]]:
+    """Frames in `state` whose wake-up was lost, oldest first; stamped.
+
+    A long queue is no loss: while the stage moves at all, only those count that later ones have overtaken.
+    """
+    before = cutoff = now - older_than_s
+    if left is not None:
+        newest = tx.scalar(select(func.max(entered)).where(left >= cutoff))
+        before = cutoff if newest is None else min(cutoff, newest - older_than_s)
+    query = (
+        select(Frame.mission_id, Frame.id)
+        .join(Mission, Mission.id == Frame.mission_id)
+        .where(Frame.state == state, entered < before, Mission.state != "deleting")
+        .where(func.coalesce(Frame.woken_at, 0.0) < cutoff)
+        .order_by(entered, Frame.id)
+        .limit(_WAKES_AT_ONCE)
+        .with_for_update(of=Frame, skip_locked=True)
+    )
+    keys = [(mission_id, frame_id) for mission_id, frame_id in tx.execute(query)]
+    for some in chunks(keys):
+        stamp = update(Frame).where(tuple_(Frame.mission_id, Frame.id).in_(some)).values(woken_at=now)
+        tx.execute(stamp.execution_options(synchronize_session=False))
+    return keys
+
+
+def _insert(tx: Session, **values: Any) -> bool:
+    statement = insert(tx, Frame).values(values).on_conflict_do_nothing().returning(Frame.id)
+    return tx.execute(statement).first() is not None
+
+
+def _reopen(tx: Session, mission: Mission, now: float) -> None:
+    mission.first_upload_at = mission.first_upload_at or now
+    mission.final_generation = None  # what was solved as final lacks this frame
+    if mission.state == "final":
+        mission.state = "open"
+        mission.finished_at = None
+        events.append(tx, mission.id, "mission", {"state": "open"}, now)
+
+
+def _advance(
+    tx: Session,
+    mission_id: str,
+    frame_id: str,
+    before: str,
+    after: str,
+    values: dict[str, Any],
+    now: float | None,
+) -> bool:
+    lock(tx, mission_id)
+    changed = _set(tx, mission_id, [frame_id], (before,), {"state": after, **values})
+    if not changed:
+        get(tx, mission_id, frame_id)  # FrameNotFound for one that never was
+    events.append_frames(tx, mission_id, after, changed, now)
+    return bool(changed)
+
+
+def _set(
+    tx: Session,
+    mission_id: str,
+    ids: Sequence[str],
+    states: tuple[str, ...],
+    values: dict[str, Any],
+    or_unplaced: bool = False,
+) -> Sequence[str]:
+    allowed: ColumnElement[bool] = Frame.state.in_(states)
+    if or_unplaced:
+        allowed = or_(allowed, and_(Frame.state == "rejected", Frame.matched_at.is_not(None)))
+    changed: Sequence[str] = []
+    for some in chunks(ids):
+        statement = (
+            update(Frame)
+            .where(Frame.mission_id == mission_id, Frame.id.in_(some), allowed)
+            .values(values)
+            .returning(Frame.id)
+            .execution_options(synchronize_session=False)
+        )
+        changed = [*changed, *tx.scalars(statement)]
+    return changed
+
+
+def _clean(text: str) -> str:
+    """Postgres refuses NUL, UTF-8 refuses lone surrogates; a file's name can hold both."""
+    return text.replace("\x00", "").encode("utf-8", "replace").decode("utf-8")

@@ -1,0 +1,204 @@
+"""Missions: open → finalising → final, and open again when another photo comes; deleting at last."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import ColumnElement, exists, func, select, tuple_
+from sqlalchemy import delete as delete_rows
+from sqlalchemy.orm import Session
+
+from services.catalog import events, leases, tiles
+from services.catalog.rows import clock, lock, mission
+from services.catalog.wakes import Wake
+from services.tables import DirtyTile, Frame, Mission, Tile
+
+_ALPHABET = "abcdefghijkmnpqrstuvwxyz23456789"  # no l, o, 0, 1: ids are read out over the radio
+_RATE_WINDOW_S = 30.0
+_UNDER_WAY = ("open", "finalising")
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a mission has come.
+
+    `counts`: frames by state, every state named. `tiles`: those that show something, overviews included.
+    `dirty`: native tiles still to be shown anew. `fused_per_s`: over the last half minute.
+    """
+
+    mission_id: str
+    state: str
+    frames: int
+    counts: Mapping[str, int]
+    revision: int
+    generation: int
+    tiles: int
+    dirty: int
+    fused_per_s: float
+    event_seq: int
+    first_upload_at: float | None
+    last_tile_at: float | None
+    finished_at: float | None
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is left to do with the photos that are there."""
+        waiting = ("received", "ready", "matched", "posed")
+        return not self.dirty and not any(self.counts[state] for state in waiting)
+
+
+def create(
+    tx: Session, name: str, mode: str = "visual", max_side: int | None = None, now: float | None = None
+) -> Mission:
+    """A new, empty mission. `mode`: visual or gnss; `max_side`: px to work on; None: all."""
+    row = Mission(
+        id="".join(secrets.choice(_ALPHABET) for _ in range(10)),
+        name=name.replace("\x00", ""),
+        mode=mode,
+        max_side=max_side,
+        state="open",
+        created_at=clock(now),
+        cameras={},
+        stage_seconds={},
+    )
+    tx.add(row)
+    tx.flush()
+    return row
+
+
+def get(tx: Session, mission_id: str) -> Mission:
+    """The mission's row; raises MissionNotFound."""
+    return mission(tx, mission_id)
+
+
+def list(tx: Session, limit: int = 100, after: str | None = None) -> Sequence[Mission]:
+    """Missions, newest first, from the one after mission `after` on, at most `limit`."""
+    query = select(Mission).where(Mission.state != "deleting")
+    if after is not None:
+        last = mission(tx, after)
+        query = query.where(tuple_(Mission.created_at, Mission.id) < tuple_(last.created_at, last.id))
+    return tx.scalars(query.order_by(Mission.created_at.desc(), Mission.id.desc()).limit(limit)).all()
+
+
+def active(tx: Session) -> Sequence[Mission]:
+    """Missions that have work left: finalising, or with a frame or tile that is still on its way."""
+    query = select(Mission).where(Mission.state.in_(_UNDER_WAY), _has_work()).order_by(Mission.id)
+    return tx.scalars(query).all()
+
+
+def request_finalise(tx: Session, mission_id: str, now: float | None = None) -> Mission:
+    """Open → finalising; a mission that is finalising or final stays so."""
+    now = clock(now)
+    row = lock(tx, mission_id)
+    if row.state == "open":
+        row.state, row.final_generation, row.woken_at = "finalising", None, now
+        events.append(tx, mission_id, "mission", {"state": "finalising"}, now)
+    return row
+
+
+def finish(tx: Session, mission_id: str, epoch: int, now: float | None = None) -> bool:
+    """Finalising → final. False while a frame or tile is on its way, or a photo came after the final solve.
+
+    Raises LeaseLost unless `epoch` is the present owner's.
+    """
+    now = clock(now)
+    leases.guard(tx, mission_id, epoch)
+    row = lock(tx, mission_id)
+    if row.state != "finalising":
+        return False
+    tiles.fuse_frames(tx, mission_id, now)
+    has_frames = tx.scalar(select(exists().where(Frame.mission_id == mission_id, Frame.meta.is_not(None))))
+    if (has_frames and row.final_generation is None) or tx.scalar(
+        select(Mission.id).where(Mission.id == mission_id, _has_unfinished())
+    ):
+        return False
+    row.state, row.finished_at = "final", now
+    events.append(tx, mission_id, "mission", {"state": "final", "revision": row.revision}, now)
+    return True
+
+
+def delete(tx: Session, mission_id: str, now: float | None = None) -> None:
+    """Hide the mission from everybody at once; `purge` follows when its objects are gone."""
+    row = lock(tx, mission_id)
+    row.woken_at = clock(now)
+    events.append(tx, mission_id, "mission", {"state": "deleting"}, now)
+    row.state = "deleting"
+
+
+def deleting(tx: Session) -> Sequence[str]:
+    """The ids of the missions whose objects and rows are still to be removed."""
+    return tx.scalars(select(Mission.id).where(Mission.state == "deleting").order_by(Mission.id)).all()
+
+
+def purge(tx: Session, mission_id: str) -> None:
+    """Remove every row of a deleted mission; nothing happens to one that was not deleted."""
+    tx.execute(delete_rows(Mission).where(Mission.id == mission_id, Mission.state == "deleting"))
+
+
+def spend(tx: Session, mission_id: str, stage: str, seconds: float) -> None:
+    """Add to the seconds of work that a stage took, all workers together."""
+    row = lock(tx, mission_id)
+    row.stage_seconds = row.stage_seconds | {stage: row.stage_seconds.get(stage, 0.0) + seconds}
+
+
+def progress(tx: Session, mission_id: str, now: float | None = None) -> Progress:
+    """How far the mission has come; raises MissionNotFound."""
+    row = mission(tx, mission_id)
+    by_state = select(Frame.state, func.count()).where(Frame.mission_id == mission_id).group_by(Frame.state)
+    counts = dict.fromkeys(("received", "ready", "matched", "posed", "fused", "rejected"), 0)
+    for state, count in tx.execute(by_state):
+        counts[state] = count
+    window = Frame.fused_at > clock(now) - _RATE_WINDOW_S
+    fused = select(func.count()).select_from(Frame).where(Frame.mission_id == mission_id, window)
+    shown = select(func.count()).where(Tile.mission_id == mission_id, Tile.object_key.is_not(None))
+    return Progress(
+        mission_id=mission_id,
+        state=row.state,
+        frames=sum(counts.values()),
+        counts=counts,
+        revision=row.revision,
+        generation=row.generation,
+        tiles=tx.scalar(shown) or 0,
+        dirty=tiles.dirty_count(tx, mission_id),
+        fused_per_s=(tx.scalar(fused) or 0) / _RATE_WINDOW_S,
+        event_seq=row.event_seq,
+        first_upload_at=row.first_upload_at,
+        last_tile_at=row.last_tile_at,
+        finished_at=row.finished_at,
+    )
+
+
+def stalled(tx: Session, older_than_s: float, now: float | None = None) -> Sequence[Wake]:
+    """Whom to wake for missions with tiles to show, or to be finished, that stood still; stamped."""
+    now = clock(now)
+    rendered = exists().where(DirtyTile.mission_id == Mission.id, DirtyTile.rendered_generation.is_not(None))
+    query = (
+        select(Mission, rendered)
+        .where(Mission.state.in_(_UNDER_WAY), func.coalesce(Mission.woken_at, 0.0) < now - older_than_s)
+        .where((Mission.state == "finalising") | _has_tiles_to_show())
+        .order_by(Mission.id)
+        .with_for_update(of=Mission, skip_locked=True)
+        .execution_options(populate_existing=True)
+    )
+    wakes: Sequence[Wake] = []
+    for row, has_rendered in tx.execute(query):
+        row.woken_at = now
+        publish = [Wake("publish", (row.id,))] if has_rendered else []
+        wakes = [*wakes, *publish, Wake("sequence", (row.id,))]
+    return wakes
+
+
+def _has_tiles_to_show() -> ColumnElement[bool]:
+    dirty = exists().where(DirtyTile.mission_id == Mission.id)
+    return dirty | exists().where(Frame.mission_id == Mission.id, Frame.state == "posed")
+
+
+def _has_unfinished() -> ColumnElement[bool]:
+    waiting = Frame.state.in_(("received", "ready", "matched"))
+    return _has_tiles_to_show() | exists().where(Frame.mission_id == Mission.id, waiting)
+
+
+def _has_work() -> ColumnElement[bool]:
+    return (Mission.state == "finalising") | _has_unfinished()

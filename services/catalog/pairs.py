@@ -1,0 +1,155 @@
+"""Pairs of frames: whoever claims one computes it, everybody else never does."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import func, or_, select, tuple_
+from sqlalchemy.orm import Session
+
+from services.catalog.rows import chunks, insert, lock
+from services.tables import Pair
+
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class PairResult:
+    """What matching one pair came to. `matches`: PairMatch.to_bytes(), None when not accepted."""
+
+    low: str
+    high: str
+    accepted: bool
+    reason: str
+    inliers: int
+    counts: Mapping[str, Any]
+    matches: bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class PairSummary:
+    """How many pairs were claimed (`total`), computed (`done`), accepted; `reasons` of all that are done."""
+
+    total: int
+    done: int
+    accepted: int
+    reasons: Mapping[str, int]
+
+
+def claim(tx: Session, mission_id: str, proposer: str | None, pairs: Iterable[Key]) -> Sequence[Key]:
+    """The pairs that `proposer` must compute: those nobody claimed before, and its own unfinished ones.
+
+    `proposer`: the id of the frame whose neighbours these are, so that its task run twice gets the same
+    pairs again. None is the final solve, which no frame outlives: it also takes over the unfinished pairs
+    of others. Pairs come back as (low, high), sorted.
+    """
+    lock(tx, mission_id)
+    keys = sorted({(min(a, b), max(a, b)) for a, b in pairs if a != b})
+    rows = [
+        {
+            "mission_id": mission_id,
+            "low": low,
+            "high": high,
+            "proposer": proposer or "",
+            "state": "claimed",
+            "accepted": False,
+            "inliers": 0,
+        }
+        for low, high in keys
+    ]
+    if rows:
+        tx.execute(insert(tx, Pair).on_conflict_do_nothing(), rows)
+    mine: list[Key] = []
+    for some in chunks(keys):
+        query = select(Pair.low, Pair.high).where(
+            Pair.mission_id == mission_id, Pair.state == "claimed", tuple_(Pair.low, Pair.high).in_(some)
+        )
+        if proposer is not None:
+            query = query.where(Pair.proposer == proposer)
+        mine += [(low, high) for low, high in tx.execute(query)]
+    return sorted(mine)
+
+
+def record(tx: Session, mission_id: str, results: Collection[PairResult]) -> None:
+    """Store results. A pair that has one keeps it: the second run of a task changes nothing."""
+    lock(tx, mission_id)
+    rows = [
+        {
+            "mission_id": mission_id,
+            "low": r.low,
+            "high": r.high,
+            "proposer": "",
+            "state": "done",
+            "accepted": r.accepted,
+            "reason": r.reason,
+            "inliers": r.inliers,
+            "counts": dict(r.counts),
+            "matches": r.matches,
+        }
+        for r in sorted(results, key=lambda r: (r.low, r.high))
+    ]
+    if not rows:
+        return
+    upsert = insert(tx, Pair)
+    columns = ("state", "accepted", "reason", "inliers", "counts", "matches")
+    upsert = upsert.on_conflict_do_update(
+        index_elements=["mission_id", "low", "high"],
+        set_={name: upsert.excluded[name] for name in columns},
+        where=Pair.state == "claimed",
+    )
+    tx.execute(upsert, rows)
+
+
+def keys(tx: Session, mission_id: str, state: str | None = None) -> Sequence[Key]:
+    """All pairs of the mission as (low, high), sorted; `state`: only the claimed or the done ones."""
+    query = select(Pair.low, Pair.high).where(Pair.mission_id == mission_id)
+    if state is not None:
+        query = query.where(Pair.state == state)
+    return [(low, high) for low, high in tx.execute(query.order_by(Pair.low, Pair.high))]
+
+
+def accepted(tx: Session, mission_id: str, touching: Collection[str] | None = None) -> Sequence[bytes]:
+    """The matches of the accepted pairs, sorted by (low, high); `touching`: only those of these frames."""
+    if touching is None:
+        return _accepted(tx, mission_id, None)
+    found: dict[Key, bytes] = {}
+    for some in chunks(sorted(touching)):
+        found |= dict(_accepted_rows(tx, mission_id, some))
+    return [found[key] for key in sorted(found)]
+
+
+def summary(tx: Session, mission_id: str) -> PairSummary:
+    """The mission's pairs, counted."""
+    query = (
+        select(Pair.state, Pair.accepted, Pair.reason, func.count())
+        .where(Pair.mission_id == mission_id)
+        .group_by(Pair.state, Pair.accepted, Pair.reason)
+    )
+    total = done = good = 0
+    reasons: dict[str, int] = {}
+    for state, is_accepted, reason, count in tx.execute(query):
+        total += count
+        if state == "done":
+            done += count
+            good += count if is_accepted else 0
+            reasons[reason or ""] = reasons.get(reason or "", 0) + count
+    return PairSummary(total, done, good, dict(sorted(reasons.items())))
+
+
+def _accepted(tx: Session, mission_id: str, touching: Sequence[str] | None) -> Sequence[bytes]:
+    return [matches for _, matches in _accepted_rows(tx, mission_id, touching)]
+
+
+def _accepted_rows(
+    tx: Session, mission_id: str, touching: Sequence[str] | None
+) -> Iterable[tuple[Key, bytes]]:
+    query = (
+        select(Pair.low, Pair.high, Pair.matches)
+        .where(Pair.mission_id == mission_id, Pair.state == "done", Pair.accepted.is_(True))
+        .order_by(Pair.low, Pair.high)
+    )
+    if touching is not None:
+        query = query.where(or_(Pair.low.in_(touching), Pair.high.in_(touching)))
+    return [((low, high), matches) for low, high, matches in tx.execute(query) if matches is not None]

@@ -1,0 +1,156 @@
+"""One database, two kinds of transaction: `write()` and `read()`; SQLite and Postgres behave the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import time
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy.engine import URL
+from sqlalchemy.orm import Session
+
+_BUSY_TIMEOUT_MS = 30_000
+_MIGRATION_LOCK = 7_041_776  # any number, the same for everybody who migrates this schema
+
+# NaN is no JSON: SQLite would store it and Postgres refuse it, so both refuse.
+_to_json = partial(json.dumps, allow_nan=False, separators=(",", ":"))
+
+
+class Database:
+    """The catalog's database. Safe to share between threads and to inherit across a fork."""
+
+    def __init__(self, url: str) -> None:
+        """`url`: SQLAlchemy's form; postgresql:// means psycopg 3."""
+        self.url = _normalised(url)
+        self.engine = _sqlite_engine(self.url) if self.is_sqlite else _postgres_engine(self.url)
+        self._writer = self.engine.execution_options(orthostream_write=True)
+        self._reader = (
+            self.engine
+            if self.is_sqlite
+            else self.engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
+        )
+        _forget_connections_in_children(self.engine)
+
+    @property
+    def is_sqlite(self) -> bool:
+        """Whether one file holds everything and one writer at a time is all there is."""
+        return self.url.get_backend_name() == "sqlite"
+
+    @contextmanager
+    def write(self) -> Iterator[Session]:
+        """A transaction that may write: commits at the end of the block, rolls back on any exception."""
+        with Session(self._writer, expire_on_commit=False) as tx, tx.begin():
+            yield tx
+
+    @contextmanager
+    def read(self) -> Iterator[Session]:
+        """A read-only transaction over one snapshot; a write inside it fails."""
+        with Session(self._reader, expire_on_commit=False, autoflush=False) as tx:
+            yield tx
+
+    def upgrade(self) -> None:
+        """Bring the schema to the newest revision; any number of processes may do it at the same time."""
+        from alembic import command  # 0.2 s to import, and only this needs it
+        from alembic.config import Config
+
+        config = Config()
+        config.set_main_option("script_location", "migrations:")
+        config.set_main_option("path_separator", "os")
+        with self._writer.begin() as connection:
+            if not self.is_sqlite:
+                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _MIGRATION_LOCK})
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+
+    def ping(self) -> None:
+        """Raise SQLAlchemy's own error when the database or its schema is not there."""
+        with self.read() as tx:
+            tx.execute(text("SELECT 1 FROM missions LIMIT 1"))
+
+    def close(self) -> None:
+        """Close the pooled connections."""
+        self.engine.dispose()
+
+
+def _normalised(url: str) -> URL:
+    parsed = make_url(url)
+    if parsed.drivername in ("postgres", "postgresql"):
+        return parsed.set(drivername="postgresql+psycopg")
+    return parsed
+
+
+def _postgres_engine(url: URL) -> Engine:
+    return create_engine(
+        url,
+        pool_size=5,
+        max_overflow=10,
+        pool_pre_ping=True,
+        json_serializer=_to_json,
+        connect_args={"connect_timeout": 10},
+    )
+
+
+def _sqlite_engine(url: URL) -> Engine:
+    if url.database and url.database != ":memory:":
+        Path(url.database).parent.mkdir(parents=True, exist_ok=True)
+    engine = create_engine(
+        url,
+        pool_size=8,
+        max_overflow=56,  # the API's thread pool is 40 wide; a connection costs a file handle
+        json_serializer=_to_json,
+        connect_args={"timeout": _BUSY_TIMEOUT_MS / 1000},
+    )
+    event.listen(engine, "connect", _prepare_sqlite)
+    event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def _prepare_sqlite(connection: Any, _record: object) -> None:
+    connection.isolation_level = None  # the driver must not begin transactions behind our back
+    cursor = connection.cursor()
+    cursor.execute(f"PRAGMA busy_timeout = {_BUSY_TIMEOUT_MS}")
+    _enter_wal(cursor)
+    cursor.execute("PRAGMA synchronous = FULL")
+    cursor.execute("PRAGMA foreign_keys = ON")
+    cursor.close()
+
+
+def _enter_wal(cursor: Any) -> None:
+    # The change of mode ignores busy_timeout while another process is changing it too.
+    deadline = time.monotonic() + _BUSY_TIMEOUT_MS / 1000
+    while True:
+        try:
+            cursor.execute("PRAGMA journal_mode = WAL")
+            return
+        except sqlite3.OperationalError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.02)
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    # A deferred transaction that reads, then writes, loses updates of others without an error: writers
+    # take the lock first.
+    write = connection.get_execution_options().get("orthostream_write", False)
+    connection.exec_driver_sql(f"PRAGMA query_only = {0 if write else 1}")
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
+
+
+def _forget_connections_in_children(engine: Engine) -> None:
+    # A connection used on both sides of a fork corrupts both; the child opens its own.
+    reference = weakref.ref(engine)
+
+    def forget() -> None:
+        inherited = reference()
+        if inherited is not None:
+            inherited.dispose(close=False)
+
+    os.register_at_fork(after_in_child=forget)
