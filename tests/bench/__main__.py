@@ -2,7 +2,7 @@
 
 python -m tests.bench flight DIR [DIR …]     `orthostream run` on folders of photos
 python -m tests.bench simulated              a simulated flight of known truth
-Both take --cores (pinned with taskset), --max-side, --pace (photos a second), --out, and --tools: a folder with
+Both take --cores (for taskset), --max-side, --pace (photos a second), --out, and --tools: a folder with
 overlap_ncc.py, gcp_error.py and score_mosaic.py, whose lines are added to the figures.
 """
 
