@@ -11,8 +11,11 @@ from functools import lru_cache
 from typing import Any
 
 import structlog
+from amqp.exceptions import AMQPError  # type: ignore[import-untyped]
 from celery import Celery
 from kombu.entity import Queue
+from kombu.exceptions import KombuError
+from redis.exceptions import RedisError
 
 from services.settings import Settings, get_settings
 
@@ -24,6 +27,8 @@ QUEUES = dict.fromkeys(("ingest", "match", "fuse", "publish", "export"), WORK) |
 PRIORITIES = {"sequence": 0, "publish": 1, "fuse": 2, "match": 3, "ingest": 4, "export": 5}
 _LOWEST = 9
 _QUIET_AFTER_FAILURE_S = 2.0
+# kombu wraps what goes wrong while it connects, not what goes wrong while it sends.
+_BROKER_AWAY = (OSError, KombuError, RedisError, AMQPError)
 
 
 def make_celery(settings: Settings) -> Celery:
@@ -64,7 +69,13 @@ class Sender:
         self._settings = settings
         self._app = make_celery(settings)
         if not _is_amqp(settings.broker_url):
-            self._app.conf.broker_transport_options |= {"socket_connect_timeout": 1.0, "socket_timeout": 2.0}
+            self._app.conf.broker_transport_options |= {
+                "max_retries": 1,
+                "interval_start": 0,
+                "interval_step": 0,
+                "socket_connect_timeout": 1.0,
+                "socket_timeout": 2.0,
+            }
         self._quiet_until = 0.0
         self._lock = threading.Lock()
 
@@ -83,7 +94,7 @@ class Sender:
                 retry=False,
                 ignore_result=True,
             )
-        except (OSError, self._app.connection_for_write().connection_errors) as error:
+        except _BROKER_AWAY as error:
             with self._lock:
                 self._quiet_until = time.monotonic() + _QUIET_AFTER_FAILURE_S
             log.warning("broker away", task=name, error=str(error))
