@@ -136,12 +136,11 @@ def _decode_tiff(data: bytes) -> Pixels:
     try:
         photo = TiffImagePlugin.TiffImageFile(BytesIO(_unrotated(data)))
         photo.load()
-    except SyntaxError as error:
-        raise NotAnImage(
-            f"The TIFF's kind of pixel is not supported ({error}). Export it as JPEG."
-        ) from error
     except Exception as error:  # Pillow's plugins raise whatever struct, int and zip do on torn files
-        raise TruncatedImage(_broken(error)) from error
+        # A torn directory and an exotic kind of pixel cannot be told apart: say both.
+        raise TruncatedImage(
+            f"The TIFF is torn, or its kind of pixel is not supported ({error}). Copy it again or export JPEGs."
+        ) from error
     if photo.mode in ("L", "LA", "1"):
         return np.asarray(photo.convert("L"), np.uint8)
     if photo.mode == "F" or photo.mode.startswith("I"):
