@@ -1,4 +1,4 @@
-"""What is kept of one picture for matching: keypoints, RootSIFT descriptors, an appearance vector, a thumbnail.
+"""What is kept of one picture for matching: keypoints, RootSIFT descriptors, appearance, a thumbnail.
 
 Zhao 2020 section 3.2: about a thousand keypoints on a small preview are enough. They are chosen strongest
 first within each cell of a grid, so that one leafy corner does not take them all, and only the chosen ones
@@ -30,11 +30,11 @@ class FeatureParams:
     """How keypoints are found.
 
     `side_px`: long side of the copy they are found on. `keypoints`: how many are kept at most. `cells`: the
-    grid has cells × cells cells. `contrast`: SIFT's threshold; low, because fields and sand have little of it.
+    grid has cells × cells cells. `contrast`: SIFT's threshold; low, because fields and sand have little.
     `octave_layers`: SIFT's scales per octave. `thumb_px`: long side of the thumbnail.
     """
 
-    side_px: int = 640
+    side_px: int = 576
     keypoints: int = 1000
     cells: int = 8
     contrast: float = 0.01
@@ -96,11 +96,10 @@ def extract(
     in whose pixels the keypoints come back. About 75 ms on one core.
     """
     params = params or FeatureParams()
-    gray = cv2.cvtColor(_shrunk(rgb, params.side_px), cv2.COLOR_RGB2GRAY)
+    copy = _shrunk(rgb, params.side_px)
+    gray = cv2.cvtColor(copy, cv2.COLOR_RGB2GRAY)
     found = _detect(gray, params)
-    # Precise upscaling: without it OpenCV's keypoints sit a quarter of a pixel off.
-    sift = cv2.SIFT_create(0, params.octave_layers, params.contrast, 10, 1.6, True)
-    chosen, sift_descriptors = sift.compute(gray, found) if found else ((), None)
+    chosen, sift_descriptors = _sift(params).compute(gray, found) if found else ((), None)
     descriptors = _root_sift(sift_descriptors)
     height, width = gray.shape
     to_original = np.array((original_size[0] / width, original_size[1] / height))
@@ -111,7 +110,7 @@ def extract(
         scale_px=(np.array([k.size for k in chosen]) * np.sqrt(to_original.prod())).astype(np.float32),
         descriptors=descriptors,
         words=appearance(descriptors),
-        thumb=_shrunk(rgb, params.thumb_px),
+        thumb=_shrunk(copy, params.thumb_px),
     )
 
 
@@ -126,21 +125,33 @@ def _shrunk(rgb: NDArray[np.uint8], side_px: int) -> NDArray[np.uint8]:
 
 
 def _detect(gray: NDArray[Any], params: FeatureParams) -> list[cv2.KeyPoint]:
-    """The strongest keypoints of every grid cell, then the strongest of what is left over."""
-    sift = cv2.SIFT_create(0, params.octave_layers, params.contrast, 10, 1.6, True)
+    """The strongest keypoints of every grid cell, the strongest of all cells first."""
+    found = _sift(params).detect(gray)
     # Response alone may tie; position and angle make the order, and so the choice, unique.
-    ranked = sorted(sift.detect(gray), key=lambda k: (-k.response, k.pt[1], k.pt[0], k.angle, k.size))
-    xy = np.array([k.pt for k in ranked]).reshape(-1, 2)
+    facts = np.array([(k.response, *k.pt, k.angle, k.size) for k in found]).reshape(-1, 5)
+    ranked = np.lexsort((facts[:, 4], facts[:, 3], facts[:, 1], facts[:, 2], -facts[:, 0]))
     height, width = gray.shape
-    column, row = (xy / (width, height) * params.cells).clip(0, params.cells - 1).astype(int).T
-    cell = row * params.cells + column
-    order = np.argsort(cell, kind="stable")
-    starts = np.searchsorted(cell[order], np.arange(params.cells**2))
-    rank = np.empty(len(ranked), int)
-    rank[order] = np.arange(len(ranked)) - starts[cell[order]]
-    # A cell's share first; sparse cells leave places that go to the best of the rest, fairest cell rank first.
+    column, row = (
+        (facts[ranked, 1:3] / (width, height) * params.cells).clip(0, params.cells - 1).astype(int).T
+    )
+    rank = rank_in_cell(row * params.cells + column)
+    # Rank by rank through the cells: a cell with few keypoints leaves its places to the others.
     chosen = np.argsort(rank, kind="stable")[: params.keypoints]
-    return [ranked[i] for i in np.sort(chosen)]
+    return [found[i] for i in ranked[np.sort(chosen)]]
+
+
+def _sift(params: FeatureParams) -> cv2.SIFT:
+    # Precise upscaling: without it OpenCV's keypoints sit a quarter of a pixel off.
+    return cv2.SIFT.create(0, params.octave_layers, params.contrast, 10, 1.6, enable_precise_upscale=True)
+
+
+def rank_in_cell(cell: NDArray[np.int_]) -> NDArray[np.int_]:
+    """For each item (N,) how many items before it lie in the same cell."""
+    order = np.argsort(cell, kind="stable")
+    inside = cell[order]
+    rank = np.empty(len(cell), np.int_)
+    rank[order] = np.arange(len(cell)) - np.searchsorted(inside, inside)
+    return rank
 
 
 def _root_sift(descriptors: NDArray[Any] | None) -> Bytes:
@@ -148,4 +159,4 @@ def _root_sift(descriptors: NDArray[Any] | None) -> Bytes:
     if descriptors is None or not len(descriptors):
         return np.zeros((0, 128), np.uint8)
     share = descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
-    return np.minimum(np.sqrt(share) * DESCRIPTOR_SCALE + 0.5, 255).astype(np.uint8)
+    return np.asarray(np.minimum(np.sqrt(share) * DESCRIPTOR_SCALE + 0.5, 255), np.uint8)

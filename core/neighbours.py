@@ -44,10 +44,10 @@ class NeighbourParams:
     either side in capture order. `alike`: most similar pictures, `alike_without_gps` for frames without GPS.
     """
 
-    nearest: int = 4
-    sectors: int = 6
+    nearest: int = 10
+    sectors: int = 8
     before_and_after: int = 2
-    alike: int = 3
+    alike: int = 4
     alike_without_gps: int = 8
 
 
@@ -117,12 +117,12 @@ def _in_space(
     for i, p in zip(located, position_of, strict=True):
         at[p].append(i)
     tree = cKDTree(xy)
-    reach = min(len(xy), 8 * params.nearest)
+    reach = min(len(xy), 8 * max(params.nearest, params.sectors) + 1)
     wanted = set(of)
     for i, p in zip(located, position_of, strict=True):
         if i in wanted:
             _, near = tree.query(xy[p], k=reach)
-            yield i, _one_each(i, at, _spread(xy, p, np.atleast_1d(near), params))
+            yield i, _one_each(i, at, _spread(xy, int(p), np.atleast_1d(near), params))
 
 
 def _metres(ordered: Sequence[Sighting], located: Sequence[int]) -> Floats:
@@ -135,7 +135,7 @@ def _metres(ordered: Sequence[Sighting], located: Sequence[int]) -> Floats:
 
 
 def _spread(xy: Floats, p: int, near: NDArray[np.intp], params: NeighbourParams) -> list[int]:
-    """Of the near positions (nearest first) the nearest few and the nearest in each direction, and p itself."""
+    """Of the near positions, nearest first, the nearest few and the nearest in each direction; p leads."""
     near = near[near != p]
     offset = xy[near] - xy[p]
     turn = np.arctan2(offset[:, 1], offset[:, 0]) / (2 * np.pi) % 1
@@ -148,7 +148,8 @@ def _one_each(i: int, at: Sequence[Sequence[int]], positions: Sequence[int]) -> 
     """One frame per position, the next in capture order; of i's own position one before and one after."""
     here = at[positions[0]]
     place = here.index(i)
-    return here[max(0, place - 1) : place + 2] + [min(at[q], key=lambda j: abs(j - i)) for q in positions[1:]]
+    there = [min(at[q], key=lambda j: abs(j - i)) for q in positions[1:]]
+    return [*here[max(0, place - 1) : place + 2], *there]
 
 
 def _in_appearance(
@@ -156,7 +157,7 @@ def _in_appearance(
 ) -> Iterable[tuple[int, list[int]]]:
     if len(ordered) < 2:
         return
-    words = np.stack([f.words for f in ordered])
+    words = _peculiar(np.stack([f.words for f in ordered]))
     for block in (of[k : k + 256] for k in range(0, len(of), 256)):
         # Rounded, so that the last bits of a product do not decide between twins: the earlier one wins.
         similarity = np.round(words[block] @ words.T / _SIMILARITY_STEP)
@@ -165,3 +166,13 @@ def _in_appearance(
         for i, row in zip(block, best, strict=True):
             count = params.alike if ordered[i].gps is not None else params.alike_without_gps
             yield i, [int(j) for j in row[: min(count, len(ordered) - 1)]]
+
+
+def _peculiar(words: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What sets each picture of the mission apart from the mission's average: (N, W), rows of length 1.
+
+    One field fills all pictures of many a flight; without this, its common look drowns the differences.
+    """
+    apart = words - words.mean(0, dtype=np.float64).astype(np.float32)
+    length = np.linalg.norm(apart, axis=1, keepdims=True)
+    return np.asarray(apart / np.maximum(length, 1e-9), np.float32)
