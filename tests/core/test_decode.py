@@ -43,6 +43,7 @@ def centroid(channel: NDArray[np.generic]) -> tuple[float, float]:
     return float((weight * x).sum() / weight.sum()), float((weight * y).sum() / weight.sum())
 
 
+@settings(deadline=None)
 @given(st.integers(1, 20_000), st.integers(1, 20_000), st.one_of(st.none(), st.integers(16, 8_000)))
 def test_scaled_size_keeps_the_shape_and_never_enlarges(
     width: int, height: int, max_side: int | None
@@ -161,6 +162,7 @@ def test_stray_bytes_of_a_careless_camera_do_no_harm_but_a_missing_half_does() -
         decode_rgb(whole[:half] + bytes(half - 2) + b"\xff\xd9")
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=300), st.sampled_from([b"", b"\xff\xd8\xff", b"II*\x00", b"MM\x00*"]))
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_garbage_is_rejected_and_nothing_else_is_raised(tail: bytes, magic: bytes) -> None:

@@ -138,6 +138,7 @@ def test_footprints_are_counter_clockwise_rings_of_what_is_seen() -> None:
     assert feature["properties"]["gsd_m"] == pytest.approx(80 / 300, abs=1e-4)
 
 
+@settings(deadline=None)
 @given(st.floats(-math.pi, math.pi), st.floats(1, 500))
 def test_no_outline_is_endless(tilt: float, height: float) -> None:
     outline = ground_outline(frame(0, 0, height, tilt=tilt).posed)

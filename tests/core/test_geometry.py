@@ -42,6 +42,7 @@ poses = st.builds(
 seeds = st.integers(0, 2**32 - 1)
 
 
+@settings(deadline=None)
 @given(cameras, seeds)
 def test_projecting_a_pixels_ray_gives_the_pixel(camera: Camera, seed: int) -> None:
     uv = spots(camera, seed)
@@ -49,11 +50,13 @@ def test_projecting_a_pixels_ray_gives_the_pixel(camera: Camera, seed: int) -> N
     np.testing.assert_allclose(camera.project(camera.rays(uv) * depth), uv, atol=2e-3)
 
 
+@settings(deadline=None)
 @given(cameras)
 def test_the_principal_ray_is_the_axis(camera: Camera) -> None:
     np.testing.assert_allclose(camera.rays(np.array([[camera.cx, camera.cy]])), [[0, 0, 1]], atol=1e-12)
 
 
+@settings(deadline=None)
 @given(cameras, st.sampled_from([0.5, 0.25, 2.0, 1 / 3]), seeds)
 def test_a_resized_photo_sees_along_the_same_rays(camera: Camera, scale: float, seed: int) -> None:
     width, height = round(camera.width * scale), round(camera.height * scale)
@@ -66,6 +69,7 @@ def test_a_resized_photo_sees_along_the_same_rays(camera: Camera, scale: float, 
     assert (back.f_px, back.cx, back.cy) == pytest.approx((camera.f_px, camera.cx, camera.cy))
 
 
+@settings(deadline=None)
 @given(cameras, poses, seeds)
 def test_ground_points_lie_on_the_plane_and_project_back(camera: Camera, pose: Pose, seed: int) -> None:
     uv = spots(camera, seed)
@@ -97,12 +101,14 @@ def test_the_world_agrees_with_proj(world: World, seed: int) -> None:
     np.testing.assert_allclose(theirs, xyz, atol=1e-5)
 
 
+@settings(deadline=None)
 @given(worlds, seeds)
 def test_to_geodetic_and_back(world: World, seed: int) -> None:
     xyz = np.random.default_rng(seed).uniform((-20_000, -20_000, -900), (20_000, 20_000, 9000), (20, 3))
     np.testing.assert_allclose(world.from_geodetic(world.to_geodetic(xyz)), xyz, atol=1e-6)
 
 
+@settings(deadline=None)
 @given(worlds)
 def test_the_origin_is_the_origin(world: World) -> None:
     lon, lat, alt = world.to_geodetic(np.zeros((1, 3)))[0]
@@ -111,6 +117,7 @@ def test_the_origin_is_the_origin(world: World) -> None:
     assert alt == pytest.approx(world.alt_m, abs=1e-7)
 
 
+@settings(deadline=None)
 @given(worlds, st.floats(-1, 1), st.floats(-1, 1))
 def test_axes_are_east_north_up(world: World, x: float, y: float) -> None:
     here, there = world.to_geodetic(np.array([[0.0, 0.0, 0.0], [x, y, 2.0]]))

@@ -105,6 +105,7 @@ def finite(meta: FrameMeta) -> bool:
     return all(math.isfinite(n) for n in numbers(meta.to_json()))
 
 
+@settings(deadline=None)
 @given(
     st.floats(-89.9, 89.9).filter(lambda v: abs(v) > 1e-3),
     st.floats(-179.9, 179.9),
@@ -311,6 +312,7 @@ def test_a_table_of_telemetry() -> None:
         parse_table("name,lat,lon\na.jpg,x,2\n")
 
 
+@settings(deadline=None)
 @given(st.recursive(
     st.none() | st.booleans() | st.floats() | st.text(max_size=20) | st.integers(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(
@@ -338,6 +340,7 @@ def test_a_broken_packet_gives_what_stands_before_the_break() -> None:
     assert read(photo(xmp=broken)).relative_alt_m == 39.8
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=600), st.binary(max_size=600))
 @example(b"Exif\x00\x00II*\x00\x08\x00\x00\x00\xff\xff", b"<x:xmpmeta")
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -364,7 +367,7 @@ FULL = photo(
 )
 
 
-@settings(max_examples=400)
+@settings(deadline=None, max_examples=400)
 @given(
     st.lists(st.tuples(st.integers(2, FULL.index(b"\xff\xdb")), st.integers(0, 255)), max_size=30),
     st.integers(0, 40),

@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -40,6 +40,7 @@ def declaring(width: int, height: int) -> bytes:
     return bytes(data)
 
 
+@settings(deadline=None)
 @given(
     st.sampled_from(["JPEG", "TIFF"]),
     st.sampled_from(sorted(MODES)),
@@ -91,6 +92,7 @@ def test_pillows_own_pixel_limit_neither_warns_nor_refuses() -> None:
     assert (header.width, header.height) == (60_000, 60_000)
 
 
+@settings(deadline=None)
 @given(st.one_of(st.binary(max_size=400), st.binary(max_size=200).map(lambda b: b"\xff\xd8\xff" + b),
                  st.binary(max_size=200).map(lambda b: b"II*\x00" + b)))  # fmt: skip
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -102,6 +104,7 @@ def test_garbage_is_refused_and_nothing_else_is_raised(data: bytes) -> None:
     assert min(header.width, header.height) >= PhotoLimits().min_side_px
 
 
+@settings(deadline=None)
 @given(st.data())
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_torn_photo_is_never_called_a_foreign_file(data: st.DataObject) -> None:
