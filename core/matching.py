@@ -47,7 +47,7 @@ class MatchParams:
     window_px: float = 5.0
     planes: int = 3
     slope_departure_px: float = 25.0
-    slope_breadth_px: float = 20.0
+    slope_breadth_px: float = 30.0
     min_similarity: float = 0.75
     min_voted: int = 10
     min_inliers: int = 10
