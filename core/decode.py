@@ -139,7 +139,7 @@ def _decode_tiff(data: bytes) -> Pixels:
     except Exception as error:  # Pillow's plugins raise whatever struct, int and zip do on torn files
         # A torn directory and an exotic kind of pixel cannot be told apart: say both.
         raise TruncatedImage(
-            f"The TIFF is torn, or its kind of pixel is not supported ({error}). Copy it again or export JPEGs."
+            f"The TIFF is torn, or of an unsupported kind of pixel ({error}). Copy it again or export JPEGs."
         ) from error
     if photo.mode in ("L", "LA", "1"):
         return np.asarray(photo.convert("L"), np.uint8)
