@@ -11,6 +11,7 @@ the levels are int16 in 1/16 grey levels.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -107,6 +108,42 @@ def _changes(coarse: Fine, coarse_labels: Labels, layer: Layer, level: int, pixe
     area = np.s_[top : top + photo.shape[0], left : left + photo.shape[1]]
     _difference(coarse[area], coarse_labels[area], photo, layer.gain, out)
     return out
+
+
+def retone(labels: Labels, weights: Int32, owns: Int32, tones: Int32, tolerance: float) -> Fine:
+    """What each knot's winner lacks to the mean tone of all photos there: (rows, cols, 3) int16.
+
+    `weights` (photos, rows, cols); `owns`, the photos' colours as they will be drawn, and `tones`, as they
+    should be: (photos, rows, cols, 3) in 1/16 grey levels. Photos count the less, the farther (in units of
+    `tolerance` grey levels) they are from the winner: what exposure and vignetting leave differs by little,
+    but where a tree leans over a road in one photo its darkness must not haunt the road in another.
+    """
+    out = np.zeros((*labels.shape, 3), np.int16)
+    _retone(labels, weights, owns, tones, (16 * tolerance) ** 2, out)
+    return out
+
+
+@compiled
+def _retone(labels: Labels, weights: Int32, owns: Int32, tones: Int32, scale: float, out: Fine) -> None:
+    for y in range(labels.shape[0]):
+        for x in range(labels.shape[1]):
+            own = labels[y, x]
+            if own < 0:
+                continue
+            total, red, green, blue = 0.0, 0.0, 0.0, 0.0
+            for k in range(weights.shape[0]):
+                if weights[k, y, x] > 0:
+                    r = tones[k, y, x, 0] - tones[own, y, x, 0]
+                    g = tones[k, y, x, 1] - tones[own, y, x, 1]
+                    b = tones[k, y, x, 2] - tones[own, y, x, 2]
+                    say = weights[k, y, x] * scale / (scale + (r * r + g * g + b * b) / 3)
+                    total += say
+                    red += say * r
+                    green += say * g
+                    blue += say * b
+            lack = (red / total, green / total, blue / total)
+            for c in range(3):
+                out[y, x, c] = tones[own, y, x, c] - owns[own, y, x, c] + math.floor(lack[c] + 0.5)
 
 
 @compiled

@@ -1,8 +1,8 @@
 """Drawing the mosaic: the pixels of a raster as a pure function of frames, poses and photos (Zhao 2020, 3.4).
 
 Which photo shows which ground is decided on a coarse lattice, so that only photos that win somewhere are read
-and warped, and only where they win. Everything is anchored to the raster's absolute pixels: neighbouring tiles
-rendered apart are equal, to the last bit, to the same tiles cut from one large block.
+and warped, and only where they win. Everything is anchored to the raster's absolute pixels: tiles rendered
+apart are equal, to the last bit, to the same tiles cut from one large block.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.blend import NOBODY, Labels, Layer, blend_finest, blend_level, gaussian_levels, label_level
+from core.blend import NOBODY, Labels, Layer, blend_finest, blend_level, gaussian_levels, label_level, retone
 from core.geometry import Array, PosedFrame, World
 from core.grid import Grid
 from core.warp import Int32, Lattice, Rgb, View, knots, look, warp
@@ -50,6 +50,7 @@ class FusionParams:
 
     bands: int = 4
     tone_side_px: int = 32
+    tone_tolerance: float = 24.0
     max_view_deg: float = 75.0
     gnss_importance: float = 0.25
     sampling: Literal["linear", "cubic"] = "linear"
@@ -142,23 +143,16 @@ class _Scene:
         if not seen:
             return None
         weights = np.stack([views[k].weight for k in seen])
-        labels = np.where(weights.any(0), weights.argmax(0), NOBODY)
-        total, mean = np.zeros(labels.shape, np.int64), np.zeros((*labels.shape, 3), np.int64)
-        for k in seen:
-            total += views[k].weight
-            mean += views[k].weight[..., None].astype(np.int64) * views[k].tone
-        mean = (mean + total[..., None] // 2) // np.maximum(total, 1)[..., None]
+        labels = np.where(weights.any(0), weights.argmax(0), NOBODY).astype(np.int16)
+        owns, tones = np.stack([views[k].own for k in seen]), np.stack([views[k].tone for k in seen])
         winners = np.unique(labels[labels != NOBODY])
         place = np.full(len(seen) + 1, NOBODY, np.int16)
         place[winners] = np.arange(len(winners))
-        own = np.zeros_like(mean)
-        for k in winners:
-            own[labels == k] = views[seen[k]].tone[labels == k]
         return cls(
             frames=[frames[seen[k]] for k in winners],
             labels=place[labels],
             weights=np.ascontiguousarray(weights[winners]),
-            retone=(mean - own).astype(np.int16),
+            retone=retone(labels, weights, owns, tones, params.tone_tolerance),
         )
 
 

@@ -23,7 +23,9 @@ WGS84_E2 = 6.69437999014e-3
 class Camera:
     """A pinhole with radial distortion x_d = x (1 + k1 r² + k2 r⁴), shared by all frames of one body.
 
-    Pixels are those of the original photo as the sensor wrote it (EXIF orientation ignored).
+    Pixels are those of the original photo as the sensor wrote it (EXIF orientation ignored). `falloff`: none,
+    or nine numbers: the logarithm of the lens's brightness is a ρ² + b ρ⁴ + c ρ⁶ with (a, b, c) for red, then
+    green, then blue; ρ = distance from (cx, cy) over half the picture's diagonal.
     """
 
     width: int
@@ -33,6 +35,7 @@ class Camera:
     cy: float
     k1: float = 0.0
     k2: float = 0.0
+    falloff: tuple[float, ...] = ()
 
     def rays(self, uv: Array) -> Array:
         """Pixels (N, 2) → viewing rays (N, 3) in the camera's frame with z = 1."""
@@ -152,7 +155,7 @@ def _ecef(lon_lat_alt: Array) -> Array:
 
 
 def _geodetic(xyz: Array) -> Array:
-    """ECEF metres (N, 3) → longitude, latitude (degrees) and height (metres): Bowring, iterated to 1e-12 rad."""
+    """ECEF metres (N, 3) → longitude, latitude (degrees) and height (metres), by Bowring to 1e-12 rad."""
     lon = np.arctan2(xyz[:, 1], xyz[:, 0])
     p = np.hypot(xyz[:, 0], xyz[:, 1])
     lat = np.arctan2(xyz[:, 2], p * (1 - WGS84_E2))

@@ -1,8 +1,8 @@
 """From the coarse lattice of a raster to the pixels of a photo.
 
 A lattice has one knot at the centre of each square cell of `cell_px` pixels, at absolute places of the
-raster's pixel plane. Frames are projected exactly, distortion included, at knots only; between knots the map is
-bilinear in fixed point, so that a pixel's value does not depend on the window that it is computed in.
+raster's pixel plane. Frames are projected exactly, distortion included, at knots only; between knots the map
+is bilinear in fixed point, so that a pixel's value does not depend on the window that it is computed in.
 """
 
 from __future__ import annotations
@@ -69,10 +69,12 @@ class View:
     """One frame seen from the lattice.
 
     `weight`: (rows, cols) int32, 0 where the frame has no say, `INSIDE` … `FULL` inside of its photo.
-    `tone`: (rows, cols, 3) int32, the photo's local mean colour in 1/16 grey levels, gain applied.
+    `own`: (rows, cols, 3) int32, the photo's local mean colour in 1/16 grey levels, gain applied. `tone`: the
+    same, relieved of the lens's falloff too.
     """
 
     weight: Int32
+    own: Int32
     tone: Int32
 
 
@@ -103,7 +105,8 @@ def look(
     `skirt_px`: how far beyond the photo's edge (pixels of the original) weights fade out.
     """
     weight = np.zeros((lattice.rows, lattice.cols), np.int32)
-    colour = np.zeros((lattice.rows, lattice.cols, 3), np.int32)
+    own = np.zeros((lattice.rows, lattice.cols, 3), np.int32)
+    light = np.zeros((lattice.rows, lattice.cols, 3), np.int32)
     pose = frame.pose
     _look(
         lattice.columns.foot,
@@ -114,13 +117,15 @@ def look(
         intrinsics(frame.camera),
         tone,
         np.array([round(16 * 256 * g) for g in frame.gain], np.int64),
+        np.array(frame.camera.falloff or (0.0,) * 9),
         importance,
         min_cos_view,
         skirt_px,
         weight.reshape(-1),
-        colour.reshape(-1, 3),
+        own.reshape(-1, 3),
+        light.reshape(-1, 3),
     )
-    return View(weight, colour)
+    return View(weight, own, light)
 
 
 def knots(lattice: Lattice, frame: PosedFrame, camera: Camera, min_cos_view: float) -> Int32:
@@ -219,13 +224,16 @@ def _look(
     lens: NDArray[np.float64],
     tone: Rgb,
     gain: NDArray[np.int64],
+    falloff: NDArray[np.float64],
     importance: float,
     min_cos_view: float,
     skirt_px: float,
     weight: Int32,
-    colour: Int32,
+    own: Int32,
+    light: Int32,
 ) -> None:
     width, height = lens[6], lens[7]
+    bare = not falloff.any()
     for k in range(foot.shape[0]):
         u, v, cos_view = _project(
             foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m, h_m, world_R_cam, center, lens
@@ -243,11 +251,15 @@ def _look(
         ty = min(max((v + 0.5) * tone.shape[0] / height - 0.5, 0.0), tone.shape[0] - 1.0)
         x0, y0 = min(int(tx), tone.shape[1] - 2), min(int(ty), tone.shape[0] - 2)
         fx, fy = int((tx - x0) * 256 + 0.5), int((ty - y0) * 256 + 0.5)
+        rho2 = 4 * ((u - lens[1]) ** 2 + (v - lens[2]) ** 2) / (width * width + height * height)
         for c in range(3):
             upper = int(tone[y0, x0, c]) * (256 - fx) + int(tone[y0, x0 + 1, c]) * fx
             lower = int(tone[y0 + 1, x0, c]) * (256 - fx) + int(tone[y0 + 1, x0 + 1, c]) * fx
             mean = upper * (256 - fy) + lower * fy
-            colour[k, c] = (mean * gain[c] + (1 << 23)) >> 24
+            own[k, c] = light[k, c] = (mean * gain[c] + (1 << 23)) >> 24
+            if not bare:
+                dim = rho2 * (falloff[3 * c] + rho2 * (falloff[3 * c + 1] + rho2 * falloff[3 * c + 2]))
+                light[k, c] = math.floor(own[k, c] * math.exp(-dim) + 0.5)
 
 
 @compiled
