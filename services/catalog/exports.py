@@ -18,8 +18,8 @@ def request(tx: Session, mission_id: str, name: str, now: float | None = None) -
 
     While it is being made (`wanted`) a second request changes nothing.
     """
-    now = clock(now)
     mission = lock(tx, mission_id)
+    now = clock(now)
     export = get(tx, mission_id, name)
     if export is not None and _is_good(tx, mission, export):
         return export, False
@@ -103,8 +103,8 @@ def _is_good(tx: Session, mission: Mission, export: Export) -> bool:
 def _end(
     tx: Session, mission_id: str, name: str, revision: int, now: float | None, **values: str | int
 ) -> bool:
-    now = clock(now)
     lock(tx, mission_id)
+    now = clock(now)
     export = get(tx, mission_id, name)
     if export is None or export.state != "wanted" or export.revision != revision:
         return False

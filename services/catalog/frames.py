@@ -47,8 +47,8 @@ def receive(
 
     Raises MissionNotFound. Put the photo's bytes into the store before this transaction commits.
     """
-    now = clock(now)
     mission = lock(tx, mission_id)
+    now = clock(now)
     created = _insert(
         tx,
         mission_id=mission_id,
@@ -79,8 +79,8 @@ def record_rejected_upload(
     now: float | None = None,
 ) -> Frame:
     """Remember an upload that was refused before it was stored, with the reason its uploader was told."""
-    now = clock(now)
     lock(tx, mission_id)
+    now = clock(now)
     created = _insert(
         tx,
         mission_id=mission_id,
@@ -133,8 +133,8 @@ def mark_rejected(
     tx: Session, mission_id: str, frame_id: str, code: str, reason: str, now: float | None = None
 ) -> bool:
     """Received or ready → rejected, because the photo itself is no good. False when that was decided."""
-    now = clock(now)
     lock(tx, mission_id)
+    now = clock(now)
     changed = _set(
         tx,
         mission_id,
@@ -150,8 +150,8 @@ def mark_posed(
     tx: Session, mission_id: str, frame_ids: Iterable[str], now: float | None = None
 ) -> Sequence[str]:
     """Matched → posed; so is one that could not be placed before. The ids that changed."""
-    now = clock(now)
     lock(tx, mission_id)
+    now = clock(now)
     values = {"state": "posed", "posed_at": now, "reason_code": None, "reason": None}
     changed = _set(tx, mission_id, sorted(frame_ids), ("matched",), values, or_unplaced=True)
     events.append_frames(tx, mission_id, "posed", changed, now)
@@ -165,8 +165,8 @@ def mark_unplaced(
 
     Such a frame stays among `sightings`: more photos may tie it in after all.
     """
-    now = clock(now)
     lock(tx, mission_id)
+    now = clock(now)
     changed: Sequence[str] = []
     for code, reason in sorted(set(reasons.values())):
         ids = sorted(f for f, why in reasons.items() if why == (code, reason))

@@ -17,8 +17,8 @@ def acquire(tx: Session, mission_id: str, owner: str, ttl_s: float, now: float |
 
     `owner` names one run of one process; whoever holds the lease does not get it a second time.
     """
-    now = clock(now)
     lock(tx, mission_id)
+    now = clock(now)
     lease = _read(tx, mission_id)
     if lease is None:
         lease = Lease(mission_id=mission_id, owner=_NOBODY, epoch=0, expires_at=0.0)

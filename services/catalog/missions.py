@@ -90,8 +90,8 @@ def active(tx: Session) -> Sequence[Mission]:
 
 def request_finalise(tx: Session, mission_id: str, now: float | None = None) -> Mission:
     """Open → finalising; a mission that is finalising or final stays so."""
-    now = clock(now)
     row = lock(tx, mission_id)
+    now = clock(now)
     if row.state == "open":
         row.state, row.final_generation, row.woken_at = "finalising", None, now
         events.append(tx, mission_id, "mission", {"state": "finalising"}, now)
@@ -103,9 +103,9 @@ def finish(tx: Session, mission_id: str, epoch: int, now: float | None = None) -
 
     Raises LeaseLost unless `epoch` is the present owner's.
     """
-    now = clock(now)
     leases.guard(tx, mission_id, epoch)
     row = lock(tx, mission_id)
+    now = clock(now)
     if row.state != "finalising":
         return False
     tiles.fuse_frames(tx, mission_id, now)

@@ -74,9 +74,9 @@ def save(tx: Session, mission_id: str, epoch: int, change: PoseUpdate, now: floa
 
     Raises LeaseLost, and writes nothing, unless `epoch` is the present owner's.
     """
-    now = clock(now)
     leases.guard(tx, mission_id, epoch)
     row = lock(tx, mission_id)
+    now = clock(now)
     row.generation += 1
     row.woken_at = now
     _save_mission(row, change)

@@ -21,7 +21,7 @@ CHUNK = 500
 
 
 def clock(now: float | None) -> float:
-    """`now`, or what the clock says when it is None."""
+    """`now`, or what the clock says when it is None. Look at it after `lock`, which may wait."""
     return time.time() if now is None else now
 
 

@@ -111,8 +111,8 @@ def claim_dirty(
 
     At most `limit_tiles`, or one block of siblings when the limit is smaller than that.
     """
-    now = clock(now)
     lock(tx, mission_id)
+    now = clock(now)
     free = _claimable(mission_id, ttl_s, now)
     block = _block()
     first = (func.min(DirtyTile.priority), func.min(DirtyTile.since), *block)
@@ -182,8 +182,8 @@ def publish(
     when none is left the revision stays. Raises RevisionConflict unless the mission is at
     `expected_revision`.
     """
-    now = clock(now)
     row = lock(tx, mission_id)
+    now = clock(now)
     if row.revision != expected_revision:
         raise RevisionConflict()
     row.woken_at = now
@@ -201,8 +201,8 @@ def publish(
 
 def fuse_frames(tx: Session, mission_id: str, now: float | None = None) -> Sequence[str]:
     """Posed → fused for the frames whose tiles show them; their ids."""
-    now = clock(now)
     lock(tx, mission_id)
+    now = clock(now)
     missing = exists().where(
         DirtyTile.mission_id == FramePose.mission_id,
         DirtyTile.z == FramePose.z,

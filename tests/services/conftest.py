@@ -1,4 +1,4 @@
-"""The backends that the memory runs on, each started by the tests themselves, and processes to race on them."""
+"""The backends that the memory runs on, started by the tests themselves, and processes to race on them."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def mission_id(db: Database) -> str:
 
 @pytest.fixture
 def race() -> Callable[[int, Callable[[int], Any]], list[Any]]:
-    """`race(n, work)`: work(0) … work(n - 1), each in a process of its own, all let go at once; their results."""
+    """`race(n, work)`: the results of work(0) … work(n - 1), each in its own process, all let go at once."""
     context = multiprocessing.get_context("fork")
 
     def child(work: Callable[[int], Any], i: int, gate: Any, pipe: Connection) -> None:
