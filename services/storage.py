@@ -71,6 +71,7 @@ class FolderStore:
         self.root = Path(root).absolute()
         self._min_free_bytes = min_free_bytes
         self._temp = self.root / _TEMP
+        self._durable: set[Path] = set()  # folders whose names are known to be on the disk
         self._temp.mkdir(parents=True, exist_ok=True)
         self._remove_leftovers()
 
@@ -178,16 +179,24 @@ class FolderStore:
     def _move(self, temp: Path, path: Path) -> None:
         for attempt in range(10):
             try:
-                new_folders = _missing(path.parent, self.root)
+                self._durable.difference_update(_missing(path.parent, self.root))
                 path.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(temp, path)
                 break
             except FileNotFoundError:  # delete_prefix took the folder away in between
                 if attempt == 9:
                     raise
-        # A name is durable only when the folder that holds it is.
-        for folder in {path.parent, *(f.parent for f in new_folders)}:
-            _sync_folder(folder)
+        with suppress(FileNotFoundError):  # it took the object away as well: nothing is left to keep
+            self._sync_names(path.parent)
+
+    def _sync_names(self, folder: Path) -> None:
+        # A name is durable only when the folder that holds it is, and that folder's own name too, even when
+        # another process made it a moment ago.
+        _sync_folder(folder)
+        while folder != self.root and folder not in self._durable:
+            _sync_folder(folder.parent)
+            self._durable.add(folder)
+            folder = folder.parent
 
     def _remove_leftovers(self) -> None:
         for temp in self._temp.iterdir():
