@@ -110,40 +110,54 @@ def _changes(coarse: Fine, coarse_labels: Labels, layer: Layer, level: int, pixe
     return out
 
 
-def retone(labels: Labels, weights: Int32, owns: Int32, tones: Int32, tolerance: float) -> Fine:
+class Tones(NamedTuple):
+    """Local mean colours of all photos at all knots, (photos, rows, cols, 3) int32 in 1/16 grey levels.
+
+    `own`: as they will be drawn; `even`: as they should be drawn, without the lens's falloff; `detail`: how
+    they depart from a much coarser mean.
+    """
+
+    own: Int32
+    even: Int32
+    detail: Int32
+
+
+def retone(labels: Labels, weights: Int32, tones: Tones, tolerance: float) -> Fine:
     """What each knot's winner lacks to the mean tone of all photos there: (rows, cols, 3) int16.
 
-    `weights` (photos, rows, cols); `owns`, the photos' colours as they will be drawn, and `tones`, as they
-    should be: (photos, rows, cols, 3) in 1/16 grey levels. Photos count the less, the farther (in units of
-    `tolerance` grey levels) they are from the winner: what exposure and vignetting leave differs by little,
-    but where a tree leans over a road in one photo its darkness must not haunt the road in another.
+    `weights`: (photos, rows, cols). Photos count the less, the more their detail differs from the winner's,
+    in units of `tolerance` grey levels. Exposure and vignetting differ over whole photos and leave no detail;
+    but where a tree leans over a road in one photo, its darkness must not haunt the road in another.
     """
     out = np.zeros((*labels.shape, 3), np.int16)
-    _retone(labels, weights, owns, tones, (16 * tolerance) ** 2, out)
+    _retone(labels, weights, *tones, (16 * tolerance) ** 2, out)
     return out
 
 
 @compiled
-def _retone(labels: Labels, weights: Int32, owns: Int32, tones: Int32, scale: float, out: Fine) -> None:
+def _retone(
+    labels: Labels, weights: Int32, own: Int32, even: Int32, detail: Int32, scale: float, out: Fine
+) -> None:
     for y in range(labels.shape[0]):
         for x in range(labels.shape[1]):
-            own = labels[y, x]
-            if own < 0:
+            winner = labels[y, x]
+            if winner < 0:
                 continue
             total, red, green, blue = 0.0, 0.0, 0.0, 0.0
+            here = even[winner, y, x]
             for k in range(weights.shape[0]):
                 if weights[k, y, x] > 0:
-                    r = tones[k, y, x, 0] - tones[own, y, x, 0]
-                    g = tones[k, y, x, 1] - tones[own, y, x, 1]
-                    b = tones[k, y, x, 2] - tones[own, y, x, 2]
+                    r = detail[k, y, x, 0] - detail[winner, y, x, 0]
+                    g = detail[k, y, x, 1] - detail[winner, y, x, 1]
+                    b = detail[k, y, x, 2] - detail[winner, y, x, 2]
                     say = weights[k, y, x] * scale / (scale + (r * r + g * g + b * b) / 3)
                     total += say
-                    red += say * r
-                    green += say * g
-                    blue += say * b
+                    red += say * (even[k, y, x, 0] - here[0])
+                    green += say * (even[k, y, x, 1] - here[1])
+                    blue += say * (even[k, y, x, 2] - here[2])
             lack = (red / total, green / total, blue / total)
             for c in range(3):
-                out[y, x, c] = tones[own, y, x, c] - owns[own, y, x, c] + math.floor(lack[c] + 0.5)
+                out[y, x, c] = here[c] - own[winner, y, x, c] + math.floor(lack[c] + 0.5)
 
 
 @compiled

@@ -16,7 +16,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.blend import NOBODY, Labels, Layer, blend_finest, blend_level, gaussian_levels, label_level, retone
+from core.blend import (
+    NOBODY,
+    Labels,
+    Layer,
+    Tones,
+    blend_finest,
+    blend_level,
+    gaussian_levels,
+    label_level,
+    retone,
+)
 from core.geometry import Array, PosedFrame, World
 from core.grid import Grid
 from core.warp import Int32, Lattice, Rgb, View, knots, look, warp
@@ -44,13 +54,14 @@ class FusionParams:
     """What the look of the mosaic depends on.
 
     `bands`: Laplacian bands above the lowest; cells are 2^bands pixels. `tone_side_px`: photos are shrunk to
-    this before their tones are averaged, the coarser the fewer ghosts. `max_view_deg`: rays flatter than this
+    this before their tones are averaged; photos whose detail differs by more than `tone_tolerance` grey levels
+    are left out, lest they leave ghosts. `max_view_deg`: rays flatter than this
     from the vertical are not drawn. `gnss_importance`: weight of frames without a visual pose.
     """
 
     bands: int = 4
     tone_side_px: int = 32
-    tone_tolerance: float = 24.0
+    tone_tolerance: float = 12.0
     max_view_deg: float = 75.0
     gnss_importance: float = 0.25
     sampling: Literal["linear", "cubic"] = "linear"
@@ -144,7 +155,11 @@ class _Scene:
             return None
         weights = np.stack([views[k].weight for k in seen])
         labels = np.where(weights.any(0), weights.argmax(0), NOBODY).astype(np.int16)
-        owns, tones = np.stack([views[k].own for k in seen]), np.stack([views[k].tone for k in seen])
+        tones = Tones(
+            np.stack([views[k].own for k in seen]),
+            np.stack([views[k].even for k in seen]),
+            np.stack([views[k].detail for k in seen]),
+        )
         winners = np.unique(labels[labels != NOBODY])
         place = np.full(len(seen) + 1, NOBODY, np.int16)
         place[winners] = np.arange(len(winners))
@@ -152,7 +167,7 @@ class _Scene:
             frames=[frames[seen[k]] for k in winners],
             labels=place[labels],
             weights=np.ascontiguousarray(weights[winners]),
-            retone=retone(labels, weights, owns, tones, params.tone_tolerance),
+            retone=retone(labels, weights, tones, params.tone_tolerance),
         )
 
 
@@ -165,7 +180,8 @@ def _view(
         importance *= params.gnss_importance
     skirt_px = SKIRT_CELLS * params.cell_px * resolution_m / gsd_m
     tone = _shrunk(photos.thumb(frame.frame_id), params.tone_side_px)
-    return look(lattice, frame, tone, importance, math.cos(math.radians(params.max_view_deg)), skirt_px)
+    tones = (tone, _shrunk(tone, params.tone_side_px // 4))
+    return look(lattice, frame, tones, importance, math.cos(math.radians(params.max_view_deg)), skirt_px)
 
 
 def _shrunk(image: Rgb, side_px: int) -> Rgb:

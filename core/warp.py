@@ -69,13 +69,14 @@ class View:
     """One frame seen from the lattice.
 
     `weight`: (rows, cols) int32, 0 where the frame has no say, `INSIDE` … `FULL` inside of its photo.
-    `own`: (rows, cols, 3) int32, the photo's local mean colour in 1/16 grey levels, gain applied. `tone`: the
-    same, relieved of the lens's falloff too.
+    `own`: (rows, cols, 3) int32, the photo's local mean colour in 1/16 grey levels, gain applied. `even`: the
+    same, relieved of the lens's falloff too. `detail`: how `own` departs from a much coarser mean.
     """
 
     weight: Int32
     own: Int32
-    tone: Int32
+    even: Int32
+    detail: Int32
 
 
 def intrinsics(camera: Camera) -> NDArray[np.float64]:
@@ -97,16 +98,21 @@ def intrinsics(camera: Camera) -> NDArray[np.float64]:
 
 
 def look(
-    lattice: Lattice, frame: PosedFrame, tone: Rgb, importance: float, min_cos_view: float, skirt_px: float
+    lattice: Lattice,
+    frame: PosedFrame,
+    tones: tuple[Rgb, Rgb],
+    importance: float,
+    min_cos_view: float,
+    skirt_px: float,
 ) -> View:
     """Weights and tones of one frame at all knots.
 
-    `tone`: the photo shrunk to a few pixels, (h, w, 3) uint8. `importance`: 0 … 1, multiplies the weight.
-    `skirt_px`: how far beyond the photo's edge (pixels of the original) weights fade out.
+    `tones`: the photo shrunk to a few pixels, and to fewer still, (h, w, 3) uint8. `importance`: 0 … 1,
+    multiplies the weight. `skirt_px`: how far beyond the photo's edge weights fade out, in its own pixels.
     """
     weight = np.zeros((lattice.rows, lattice.cols), np.int32)
     own = np.zeros((lattice.rows, lattice.cols, 3), np.int32)
-    light = np.zeros((lattice.rows, lattice.cols, 3), np.int32)
+    light, detail = np.zeros_like(own), np.zeros_like(own)
     pose = frame.pose
     _look(
         lattice.columns.foot,
@@ -115,7 +121,7 @@ def look(
         np.asarray(pose.center, np.float64),
         float(pose.ground_h_m),
         intrinsics(frame.camera),
-        tone,
+        *tones,
         np.array([round(16 * 256 * g) for g in frame.gain], np.int64),
         np.array(frame.camera.falloff or (0.0,) * 9),
         importance,
@@ -124,8 +130,9 @@ def look(
         weight.reshape(-1),
         own.reshape(-1, 3),
         light.reshape(-1, 3),
+        detail.reshape(-1, 3),
     )
-    return View(weight, own, light)
+    return View(weight, own, light, detail)
 
 
 def knots(lattice: Lattice, frame: PosedFrame, camera: Camera, min_cos_view: float) -> Int32:
@@ -215,6 +222,18 @@ def _knots(
 
 
 @compiled
+def _sample(image: Rgb, right: float, down: float, c: int) -> int:
+    """One channel, bilinear, at shares (0 … 1) of the picture's width and height; in 1/65536 grey levels."""
+    x = min(max(right * image.shape[1] - 0.5, 0.0), image.shape[1] - 1.0)
+    y = min(max(down * image.shape[0] - 0.5, 0.0), image.shape[0] - 1.0)
+    x0, y0 = min(int(x), image.shape[1] - 2), min(int(y), image.shape[0] - 2)
+    fx, fy = int((x - x0) * 256 + 0.5), int((y - y0) * 256 + 0.5)
+    upper = int(image[y0, x0, c]) * (256 - fx) + int(image[y0, x0 + 1, c]) * fx
+    lower = int(image[y0 + 1, x0, c]) * (256 - fx) + int(image[y0 + 1, x0 + 1, c]) * fx
+    return upper * (256 - fy) + lower * fy
+
+
+@compiled
 def _look(
     foot: NDArray[np.float64],
     slope: NDArray[np.float64],
@@ -222,7 +241,8 @@ def _look(
     center: NDArray[np.float64],
     h_m: float,
     lens: NDArray[np.float64],
-    tone: Rgb,
+    fine: Rgb,
+    coarse: Rgb,
     gain: NDArray[np.int64],
     falloff: NDArray[np.float64],
     importance: float,
@@ -231,6 +251,7 @@ def _look(
     weight: Int32,
     own: Int32,
     light: Int32,
+    detail: Int32,
 ) -> None:
     width, height = lens[6], lens[7]
     bare = not falloff.any()
@@ -247,16 +268,11 @@ def _look(
             across, along = 2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1
             value = (1 - across * across) * (1 - along * along) * cos_view * cos_view * cos_view * cos_view
             weight[k] = INSIDE + int((FULL - INSIDE) * importance * value)
-        tx = min(max((u + 0.5) * tone.shape[1] / width - 0.5, 0.0), tone.shape[1] - 1.0)
-        ty = min(max((v + 0.5) * tone.shape[0] / height - 0.5, 0.0), tone.shape[0] - 1.0)
-        x0, y0 = min(int(tx), tone.shape[1] - 2), min(int(ty), tone.shape[0] - 2)
-        fx, fy = int((tx - x0) * 256 + 0.5), int((ty - y0) * 256 + 0.5)
+        right, down = (u + 0.5) / width, (v + 0.5) / height
         rho2 = 4 * ((u - lens[1]) ** 2 + (v - lens[2]) ** 2) / (width * width + height * height)
         for c in range(3):
-            upper = int(tone[y0, x0, c]) * (256 - fx) + int(tone[y0, x0 + 1, c]) * fx
-            lower = int(tone[y0 + 1, x0, c]) * (256 - fx) + int(tone[y0 + 1, x0 + 1, c]) * fx
-            mean = upper * (256 - fy) + lower * fy
-            own[k, c] = light[k, c] = (mean * gain[c] + (1 << 23)) >> 24
+            own[k, c] = light[k, c] = (_sample(fine, right, down, c) * gain[c] + (1 << 23)) >> 24
+            detail[k, c] = own[k, c] - ((_sample(coarse, right, down, c) * gain[c] + (1 << 23)) >> 24)
             if not bare:
                 dim = rho2 * (falloff[3 * c] + rho2 * (falloff[3 * c + 1] + rho2 * falloff[3 * c + 2]))
                 light[k, c] = math.floor(own[k, c] * math.exp(-dim) + 0.5)
