@@ -54,9 +54,9 @@ class FusionParams:
     """What the look of the mosaic depends on.
 
     `bands`: Laplacian bands above the lowest; cells are 2^bands pixels. `tone_side_px`: photos are shrunk to
-    this before their tones are averaged; photos whose detail differs by more than `tone_tolerance` grey levels
-    are left out, lest they leave ghosts. `max_view_deg`: rays flatter than this
-    from the vertical are not drawn. `gnss_importance`: weight of frames without a visual pose.
+    this before their tones are averaged; photos whose detail differs by more than `tone_tolerance` grey
+    levels are left out, lest they leave ghosts. `max_view_deg`: rays flatter than this from the vertical are
+    not drawn. `gnss_importance`: weight of frames without a visual pose.
     """
 
     bands: int = 4
