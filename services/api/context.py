@@ -55,5 +55,14 @@ def _mission_id(mission_id: Annotated[str, PathParameter(description="The missio
     return mission_id
 
 
+def _public_url(request: Request) -> str:
+    settings = _services(request).settings
+    # Unless somebody said where we are to be found, the caller's own way here is the one that works.
+    if settings.public_url == f"http://{settings.host}:{settings.port}":
+        return str(request.base_url).rstrip("/")
+    return settings.public_url
+
+
+PublicUrl = Annotated[str, Depends(_public_url)]
 Use = Annotated[Services, Depends(_services)]
 MissionId = Annotated[str, Depends(_mission_id)]

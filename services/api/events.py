@@ -32,8 +32,8 @@ async def stream_events(
     after: Annotated[int | None, Query(ge=0, le=2**53, description="Number of the last event seen")] = None,
     last_event_id: Annotated[str | None, Header()] = None,
 ) -> EventSourceResponse:
-    """What happens: `tiles` {revision, tiles: [[z, x, y]…]}, `frame` {state, frames: [id…]}, `mission`, `export`,
-    `progress`, `heartbeat`.
+    """What happens: `tiles` {revision, tiles: [[z, x, y]…]}, `frame` {state, frames: [id…]}, `mission`,
+    `export`, `progress`, `heartbeat`.
 
     It goes on after the event named by the `Last-Event-ID` header or by `after`; without either, from now.
     """

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 
-from services.api.context import MissionId, Use
+from services.api.context import MissionId, PublicUrl, Use
 from services.api.documents import (
     MissionIn,
     MissionOut,
@@ -22,11 +22,11 @@ router = APIRouter(tags=["missions"])
 
 
 @router.post("/missions", status_code=201)
-def create_mission(body: MissionIn, response: Response, services: Use) -> MissionOut:
+def create_mission(body: MissionIn, response: Response, services: Use, public_url: PublicUrl) -> MissionOut:
     """A new, empty mission; its id is in the answer and in `Location`."""
     with services.db.write() as tx:
         row = missions.create(tx, body.name, body.mode, body.max_side)
-        document = mission_document(tx, row, services.settings.public_url)
+        document = mission_document(tx, row, public_url)
     response.headers["Location"] = f"/api/v1/missions/{row.id}"
     return document
 
@@ -34,21 +34,22 @@ def create_mission(body: MissionIn, response: Response, services: Use) -> Missio
 @router.get("/missions")
 def list_missions(
     services: Use,
+    public_url: PublicUrl,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     after: Annotated[str | None, Query(pattern="^[a-z0-9]{1,40}$")] = None,
 ) -> MissionPage:
     """All missions, newest first, a page at a time."""
     with services.db.read() as tx:
         rows = missions.list(tx, limit + 1, after)
-        shown = [mission_document(tx, row, services.settings.public_url) for row in rows[:limit]]
+        shown = [mission_document(tx, row, public_url) for row in rows[:limit]]
     return MissionPage(missions=shown, next=shown[-1].id if len(rows) > limit else None)
 
 
 @router.get("/missions/{mission_id}")
-def get_mission(mission_id: MissionId, services: Use) -> MissionOut:
+def get_mission(mission_id: MissionId, services: Use, public_url: PublicUrl) -> MissionOut:
     """One mission with its progress."""
     with services.db.read() as tx:
-        return mission_document(tx, missions.get(tx, mission_id), services.settings.public_url)
+        return mission_document(tx, missions.get(tx, mission_id), public_url)
 
 
 @router.get("/missions/{mission_id}/progress")
@@ -59,14 +60,14 @@ def get_progress(mission_id: MissionId, services: Use) -> ProgressOut:
 
 
 @router.post("/missions/{mission_id}/finalise", status_code=202)
-def finalise_mission(mission_id: MissionId, services: Use) -> MissionOut:
+def finalise_mission(mission_id: MissionId, services: Use, public_url: PublicUrl) -> MissionOut:
     """Solve all photos together and draw the final map; the same photos give the same bytes.
 
     Photos that come later open the mission again. Asking twice changes nothing.
     """
     with services.db.write() as tx:
         row = missions.request_finalise(tx, mission_id)
-        document = mission_document(tx, row, services.settings.public_url)
+        document = mission_document(tx, row, public_url)
     if document.state == "finalising":
         services.send("sequence", mission_id)
     return document

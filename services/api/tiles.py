@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
 
-from services.api.context import MissionId, Services, Use
+from services.api.context import MissionId, PublicUrl, Services, Use
 from services.api.problems import RevisionGone
 from services.catalog import missions, tiles
 from services.catalog.tiles import StoredTile, TileBox
@@ -67,7 +67,7 @@ def get_tile_at_revision(
 
 
 @router.get("/missions/{mission_id}/tilejson.json")
-def get_tilejson(mission_id: MissionId, services: Use) -> dict[str, Any]:
+def get_tilejson(mission_id: MissionId, services: Use, public_url: PublicUrl) -> dict[str, Any]:
     """TileJSON 3.0 of the map as it is now, for MapLibre, QGIS and others."""
     with services.db.read() as tx:
         row = missions.get(tx, mission_id)
@@ -77,7 +77,7 @@ def get_tilejson(mission_id: MissionId, services: Use) -> dict[str, Any]:
         "name": row.name,
         "version": f"1.0.{row.revision}",
         "scheme": "xyz",
-        "tiles": [f"{services.settings.public_url}/api/v1/missions/{row.id}/tiles/{{z}}/{{x}}/{{y}}"],
+        "tiles": [f"{public_url}/api/v1/missions/{row.id}/tiles/{{z}}/{{x}}/{{y}}"],
         "tileSize": 512,
         "minzoom": 0,
         "maxzoom": row.zoom if row.zoom is not None else 0,
