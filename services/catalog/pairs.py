@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import func, or_, select, tuple_
+from sqlalchemy import func, or_, select
 from sqlalchemy.orm import Session
 
 from services.catalog.rows import chunks, insert, lock
@@ -61,15 +61,12 @@ def claim(tx: Session, mission_id: str, proposer: str | None, pairs: Iterable[Ke
     ]
     if rows:
         tx.execute(insert(tx, Pair).on_conflict_do_nothing(), rows)
-    mine: list[Key] = []
-    for some in chunks(keys):
-        query = select(Pair.low, Pair.high).where(
-            Pair.mission_id == mission_id, Pair.state == "claimed", tuple_(Pair.low, Pair.high).in_(some)
-        )
-        if proposer is not None:
-            query = query.where(Pair.proposer == proposer)
-        mine += [(low, high) for low, high in tx.execute(query)]
-    return sorted(mine)
+    # All unfinished ones, which are few, rather than a list of thousands of keys in the query.
+    query = select(Pair.low, Pair.high).where(Pair.mission_id == mission_id, Pair.state == "claimed")
+    if proposer is not None:
+        query = query.where(Pair.proposer == proposer)
+    unfinished = {(low, high) for low, high in tx.execute(query)}
+    return [key for key in keys if key in unfinished]
 
 
 def record(tx: Session, mission_id: str, results: Collection[PairResult]) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -124,6 +127,34 @@ def test_more_threads_than_pooled_connections_all_get_their_turn(db: Database, m
     with db.read() as tx:
         assert missions.get(tx, mission_id).stage_seconds == {"api": 40.0}
     assert len(done) == 40
+
+
+def test_a_writer_that_is_killed_holds_nobody_up(db: Database, mission_id: str) -> None:
+    def die() -> None:
+        with db.write() as tx:
+            lock(tx, mission_id).name = "never"
+            tx.flush()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    process = multiprocessing.get_context("fork").Process(target=die)
+    process.start()
+    process.join(30)
+    assert process.exitcode == -signal.SIGKILL
+    with db.write() as tx:
+        assert lock(tx, mission_id).name == "a flood"
+
+
+def test_a_writer_inside_a_writer_is_told_rather_than_left_waiting(migrated_sqlite: Path) -> None:
+    database = Database(f"sqlite:///{migrated_sqlite}")
+
+    def nest() -> None:
+        with database.write(), database.write():
+            pass
+
+    with pytest.raises(RuntimeError, match="wait for itself"):
+        nest()
+    with database.write() as tx:  # and the turn was given back
+        assert missions.list(tx) == []
 
 
 def test_sqlite_is_durable_and_concurrent(migrated_sqlite: Path) -> None:
