@@ -1,0 +1,140 @@
+"""Which tiles a posed frame is drawn on, how fine the map's tiles are, and how far up its pyramid goes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from core.fusion import FrameIndex, FusionParams, Photos, render
+from core.geometry import Array, PosedFrame, World
+from core.grid import (
+    TILE_PX,
+    MercatorGrid,
+    TileKey,
+    ancestors,
+    children,
+    native_zoom,
+    tiles_of,
+    zoom_resolution_m,
+)
+from core.outline import ground_outline
+from core.pyramid import Rgba, decode, encode, reduce
+
+FUSION = FusionParams()
+SPARE_ZOOMS = 2
+"""The pyramid goes on so far above the zoom at which one tile shows the whole mission."""
+
+Encoded = tuple[bytes, str]
+
+
+def shown_gsd_m(frame: PosedFrame, max_side: int | None) -> float:
+    """Ground metres per pixel of the frame's photo at the mission's resolution."""
+    long_side = max(frame.camera.width, frame.camera.height)
+    return frame.pose.gsd_m(frame.camera) * long_side / min(long_side, max_side or long_side)
+
+
+def mission_gsd_m(frames: Iterable[PosedFrame], max_side: int | None) -> float | None:
+    """The median over the frames that show ground, None when none does."""
+    found = [shown_gsd_m(f, max_side) for f in frames if ground_outline(f) is not None]
+    return float(np.median(found)) if found else None
+
+
+def mission_zoom(
+    frames: Iterable[PosedFrame], world: World, max_side: int | None, zoom_now: int | None = None
+) -> int | None:
+    """The zoom of the native tiles, None when no frame shows ground.
+
+    `zoom_now` is kept while it is nearly right: another zoom means that every tile is drawn anew.
+    """
+    gsd_m = mission_gsd_m(frames, max_side)
+    if gsd_m is None:
+        return zoom_now
+    if zoom_now is not None and 0.55 < zoom_resolution_m(zoom_now, world.lat_deg) / gsd_m < 1.5:
+        return zoom_now
+    return native_zoom(gsd_m, world.lat_deg)
+
+
+def tiles_under(frame: PosedFrame, world: World, zoom: int, params: FusionParams = FUSION) -> set[TileKey]:
+    """Every tile of that zoom of which the frame may change a pixel."""
+    outline = ground_outline(frame)
+    if outline is None:
+        return set()
+    return tiles_of(world, outline, frame.pose.ground_h_m, zoom, params.reach_px)
+
+
+def outline_px(frame: PosedFrame, world: World, zoom: int) -> Array | None:
+    """The frame's outline (4, 2) in the pixels of that zoom, None when it shows no ground."""
+    outline = ground_outline(frame)
+    if outline is None:
+        return None
+    grid = MercatorGrid(zoom, 0, 0, 0, 0)
+    return np.column_stack(grid.from_world(world, outline, frame.pose.ground_h_m))
+
+
+def blocks(tiles: Iterable[TileKey], side: int = 2) -> list[list[TileKey]]:
+    """The tiles in groups that share one square of `side` × `side` tiles, in a fixed order."""
+    groups: dict[tuple[int, int, int], list[TileKey]] = {}
+    for tile in sorted(set(tiles)):
+        groups.setdefault((tile.z, tile.x // side, tile.y // side), []).append(tile)
+    return [groups[key] for key in sorted(groups)]
+
+
+def block_grid(tiles: Sequence[TileKey]) -> MercatorGrid:
+    """The smallest raster that holds these tiles of one zoom."""
+    xs, ys = [t.x for t in tiles], [t.y for t in tiles]
+    width, height = max(xs) - min(xs) + 1, max(ys) - min(ys) + 1
+    return MercatorGrid(tiles[0].z, min(xs) * TILE_PX, min(ys) * TILE_PX, width * TILE_PX, height * TILE_PX)
+
+
+def draw_block(
+    tiles: Sequence[TileKey],
+    world: World,
+    frames: Sequence[PosedFrame] | FrameIndex,
+    photos: Photos,
+    params: FusionParams = FUSION,
+) -> dict[TileKey, Encoded | None]:
+    """The tiles' encoded pictures, drawn together; None for those on which nothing is known."""
+    grid = block_grid(tiles)
+    near = frames.overlapping(grid, world) if isinstance(frames, FrameIndex) else frames
+    picture = render(grid, world, near, photos, params)
+    drawn: dict[TileKey, Encoded | None] = {}
+    for tile in tiles:
+        top, left = tile.y * TILE_PX - grid.row0, tile.x * TILE_PX - grid.col0
+        drawn[tile] = encode(np.ascontiguousarray(picture[top : top + TILE_PX, left : left + TILE_PX]))
+    return drawn
+
+
+def top_zoom(tiles: Collection[TileKey]) -> int:
+    """The zoom of the pyramid's uppermost tiles over these native ones (of one zoom, at least one)."""
+    zoom = next(iter(tiles)).z
+    xs, ys = [t.x for t in tiles], [t.y for t in tiles]
+    spread = max(min(xs) ^ max(xs), min(ys) ^ max(ys))
+    return max(0, zoom - spread.bit_length() - SPARE_ZOOMS)
+
+
+def overview(pictures: Sequence[Rgba | None]) -> Encoded | None:
+    """An overview's encoded picture from its children's pictures (NW, NE, SW, SE; None = nothing known)."""
+    return encode(reduce(pictures)) if any(p is not None for p in pictures) else None
+
+
+def pyramid(natives: Mapping[TileKey, bytes]) -> dict[TileKey, bytes]:
+    """All overviews of native tiles (of one zoom), from their encoded pictures."""
+    tiles = dict(natives)
+    if not tiles:
+        return {}
+    above: dict[TileKey, bytes] = {}
+    for tile in ancestors(tiles, top_zoom(tiles)):
+        below = [decode(tiles[c]) if c in tiles else None for c in children(tile)]
+        encoded = overview(below)
+        if encoded is not None:
+            tiles[tile] = above[tile] = encoded[0]
+    return above
+
+
+def moved_px(before: Array | None, after: Array | None) -> float:
+    """How far the corner that moved most has moved; inf when only one of the outlines is there."""
+    if before is None or after is None:
+        return 0.0 if before is after else math.inf
+    return float(np.hypot(*(after - before).T).max())

@@ -1,0 +1,179 @@
+"""The whole chain in one process, on one page: the oracle that the distributed result must equal.
+
+Photos → metadata, features → neighbours → matches → poses → exposure → tiles → pyramid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
+
+import numpy as np
+
+from core.coverage import FUSION, blocks, draw_block, mission_zoom, pyramid, tiles_under
+from core.decode import Pixels, decode_rgb
+from core.errors import RejectedFrame
+from core.exposure import balanced
+from core.features import FeatureParams, Features, extract
+from core.fusion import FrameIndex
+from core.geometry import Camera, Pose, PosedFrame, World
+from core.grid import TileKey
+from core.matching import PairMatch, match_pair
+from core.metadata import read_metadata
+from core.neighbours import Sighting, candidates
+from core.photo import probe
+from core.pose_graph import GraphFrame, Solution, solve
+
+FEATURE_SIDE_PX = FeatureParams().side_px
+"""Keypoints are found on a copy of this size, so nothing larger is decoded for them."""
+MOST_TILES = 4096
+"""A frame that would cover more native tiles than this was posed so far off that it would bury the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Everything that the tiles are drawn from, besides the photos. `under`: each frame's native tiles.
+
+    `rejected`: frame id → error code of `core.errors`.
+    """
+
+    world: World
+    zoom: int | None
+    cameras: Mapping[str, Camera]
+    frames: Mapping[str, PosedFrame]
+    under: Mapping[str, frozenset[TileKey]]
+    rejected: Mapping[str, str]
+
+    @property
+    def cover(self) -> set[TileKey]:
+        """All native tiles."""
+        return set[TileKey]().union(*self.under.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Mosaic:
+    """A finished map. `tiles`: the encoded picture of every tile, overviews included."""
+
+    solution: Solution
+    layout: Layout
+    tiles: Mapping[TileKey, bytes]
+    rejected: Mapping[str, str]
+
+
+def frame_id_of(data: bytes) -> str:
+    """What a photo is called everywhere: the first 32 hex digits of its sha256."""
+    return sha256(data).hexdigest()[:32]
+
+
+def lay_out(
+    solution: Solution,
+    camera_keys: Mapping[str, str],
+    thumb: Callable[[str], Pixels],
+    max_side: int | None,
+    zoom_now: int | None = None,
+) -> Layout:
+    """Where and how bright every posed frame is drawn. `zoom_now`: kept while it fits well enough."""
+    bare = [
+        PosedFrame(k, solution.cameras[camera_keys[k]], _plain(solution.poses[k]))
+        for k in sorted(solution.poses)
+    ]
+    zoom = mission_zoom(bare, solution.world, max_side, zoom_now)
+    under = {f.frame_id: tiles_under(f, solution.world, zoom) if zoom is not None else set() for f in bare}
+    good = [f for f in bare if 0 < len(under[f.frame_id]) <= MOST_TILES]
+    lit = balanced(good, solution.world, {f.frame_id: thumb(f.frame_id) for f in good})
+    frames = {f.frame_id: replace(f, gain=_rgb(f.gain)) for f in lit}
+    lost = {f.frame_id: "oblique" for f in bare} | dict(solution.unplaced)
+    return Layout(
+        world=solution.world,
+        zoom=zoom,
+        cameras=dict(solution.cameras) | {camera_keys[k]: f.camera for k, f in frames.items()},
+        frames=frames,
+        under={k: frozenset(under[k]) for k in frames},
+        rejected={k: code for k, code in lost.items() if k not in frames},
+    )
+
+
+def _plain(pose: Pose) -> Pose:
+    """Contiguous arrays: how a product is rounded may depend on how its factors lie in memory."""
+    return replace(
+        pose,
+        world_R_cam=np.array(pose.world_R_cam, np.float64, order="C"),
+        center=np.array(pose.center, np.float64),
+        ground_h_m=float(pose.ground_h_m),
+    )
+
+
+def _rgb(gain: Sequence[float]) -> tuple[float, float, float]:
+    return float(gain[0]), float(gain[1]), float(gain[2])
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """A photo that was understood."""
+
+    frame: GraphFrame
+    features: Features
+    data: bytes
+
+    @property
+    def sighting(self) -> Sighting:
+        meta = self.frame.meta
+        return Sighting(
+            self.frame.frame_id, meta.captured_s, self.frame.name, meta.drone, meta.gps, self.features.words
+        )
+
+
+class _Photos:
+    """The photos in memory, decoded at the mission's resolution when asked for."""
+
+    def __init__(self, read: Mapping[str, _Read], max_side: int | None) -> None:
+        self._read = read
+        self._max_side = max_side
+        self._decoded: dict[str, Pixels] = {}
+
+    def photo(self, frame_id: str) -> Pixels:
+        if frame_id not in self._decoded:
+            self._decoded[frame_id] = decode_rgb(self._read[frame_id].data, self._max_side)
+        return self._decoded[frame_id]
+
+    def thumb(self, frame_id: str) -> Pixels:
+        return self._read[frame_id].features.thumb
+
+
+def build(photos: Sequence[tuple[str, bytes]], max_side: int | None = None, mode: str = "visual") -> Mosaic:
+    """The map of some photos (name, bytes), whatever their order. `mode`: visual or gnss."""
+    rejected: dict[str, str] = {}
+    read: dict[str, _Read] = {}
+    for name, data in photos:
+        frame_id = frame_id_of(data)
+        try:
+            meta = read_metadata(data, probe(data))
+            features = extract(decode_rgb(data, FEATURE_SIDE_PX), (meta.width, meta.height))
+        except RejectedFrame as error:
+            rejected[frame_id] = error.code
+        else:
+            read[frame_id] = _Read(GraphFrame(frame_id, name, meta), features, data)
+    matches = [_matched(read[a], read[b]) for a, b in candidates([r.sighting for r in read.values()])]
+    if mode == "gnss":
+        matches = []
+    solution = solve([r.frame for r in read.values()], [m for m in matches if m.accepted])
+    camera_keys = {k: r.frame.meta.camera_key for k, r in read.items()}
+    layout = lay_out(solution, camera_keys, lambda k: read[k].features.thumb, max_side)
+    tiles = draw(layout, _Photos(read, max_side))
+    return Mosaic(solution, layout, tiles, rejected | dict(layout.rejected))
+
+
+def draw(layout: Layout, photos: _Photos) -> dict[TileKey, bytes]:
+    """Every tile that shows something, overviews included."""
+    index = FrameIndex(layout.frames.values(), FUSION)
+    natives: dict[TileKey, bytes] = {}
+    for block in blocks(layout.cover):
+        drawn = draw_block(block, layout.world, index, photos)
+        natives |= {tile: encoded[0] for tile, encoded in drawn.items() if encoded is not None}
+    return natives | pyramid(natives)
+
+
+def _matched(low: _Read, high: _Read) -> PairMatch:
+    cameras = low.frame.meta.camera(), high.frame.meta.camera()
+    return match_pair(low.frame.frame_id, low.features, high.frame.frame_id, high.features, *cameras)

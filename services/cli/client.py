@@ -1,0 +1,162 @@
+"""The service as a drone or a script sees it: a few HTTP calls that do not give up when the network does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from core.errors import OrthostreamError
+
+RETRY_S = 300.0
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.3, 10.0
+_AGAIN = (408, 425, 429, 500, 502, 503, 504, 507)
+
+
+class ServerAway(OrthostreamError):
+    """The server does not answer. Is it running, and is its address right?"""
+
+    code = "server_away"
+
+
+class Refused(OrthostreamError):
+    """The server refused the request."""
+
+    code = "refused"
+
+
+@dataclass(frozen=True, slots=True)
+class Uploaded:
+    """What the service said of one photo. `detail`: why it was rejected, None when it was taken."""
+
+    name: str
+    frame_id: str | None
+    state: str
+    created: bool
+    detail: str | None = None
+
+
+class Client:
+    """One server's API v1. Safe to share between threads."""
+
+    def __init__(self, url: str, retry_s: float = RETRY_S) -> None:
+        """`url`: of the server, without a path. `retry_s`: for how long a call tries before it gives up."""
+        self.url = url.rstrip("/")
+        self._retry_s = retry_s
+        self._http = httpx.Client(
+            base_url=f"{self.url}/api/v1",
+            timeout=httpx.Timeout(60.0, connect=10.0, pool=None),
+            limits=httpx.Limits(max_connections=16, max_keepalive_connections=16),
+            trust_env=not self.url.startswith(("http://127.0.0.1", "http://localhost", "http://[::1]")),
+        )
+
+    def close(self) -> None:
+        """Drops the connections."""
+        self._http.close()
+
+    def create(self, name: str, mode: str, max_side: int | None) -> str:
+        """A new mission's id."""
+        body = {"name": name, "mode": mode, "max_side": max_side}
+        return str(self._json("POST", "/missions", json=body)["id"])
+
+    def mission(self, mission_id: str) -> dict[str, Any] | None:
+        """The mission's document, None when the server does not know it."""
+        answer = self._ask("GET", f"/missions/{mission_id}")
+        return None if answer.status_code == 404 else self._good(answer).json()
+
+    def progress(self, mission_id: str) -> dict[str, Any]:
+        """Counts by state and what else is known of the mission's progress."""
+        return self._json("GET", f"/missions/{mission_id}/progress")
+
+    def frames(self, mission_id: str, state: str | None = None) -> list[dict[str, Any]]:
+        """All frames, or those of one state."""
+        found: list[dict[str, Any]] = []
+        after: str | None = None
+        while True:
+            asked = {"state": state, "after": after, "limit": 1000}
+            query = {k: v for k, v in asked.items() if v is not None}
+            page = self._json("GET", f"/missions/{mission_id}/frames", params=query)
+            found += page["frames"]
+            after = page["next"]
+            if after is None:
+                return found
+
+    def upload(self, mission_id: str, name: str, data: bytes, telemetry: str | None = None) -> Uploaded:
+        """Sends one photo, again and again until the service has said what it thinks of it."""
+        fields = {"telemetry": telemetry} if telemetry else None
+        answer = self._ask(
+            "POST", f"/missions/{mission_id}/frames", files={"files": (name, data)}, data=fields
+        )
+        if answer.is_success:
+            said = answer.json()["frames"][0]
+        else:
+            problem = _problem(answer)
+            said = next(iter(problem.get("errors") or []), None)
+            if said is None or "state" not in said:
+                raise Refused(str(problem.get("detail") or f"The server answered {answer.status_code}."))
+        return Uploaded(name, said.get("frame_id"), said["state"], said["created"], said.get("detail"))
+
+    def finalise(self, mission_id: str) -> None:
+        """Asks for the final map."""
+        self._json("POST", f"/missions/{mission_id}/finalise")
+
+    def download(self, mission_id: str, name: str, path: Path, wait: Callable[[], None]) -> bool:
+        """Fetches one export into `path`, calling `wait` while it is made; False when it cannot be made."""
+        url = f"/missions/{mission_id}/exports/{name}"
+        while True:
+            answer = self._ask("GET", url, headers={"Range": "bytes=0-0"})
+            if answer.status_code == 409:
+                return False
+            if self._good(answer).status_code != 202:
+                break
+            wait()
+            time.sleep(0.25)
+        part = path.with_name(path.name + ".part")
+        self._stubbornly(lambda: self._stream(url, part))
+        part.replace(path)
+        return True
+
+    def _stream(self, url: str, path: Path) -> httpx.Response:
+        with self._http.stream("GET", url) as answer, path.open("wb") as out:
+            for chunk in answer.iter_bytes(1 << 20):
+                out.write(chunk)
+        return answer
+
+    def _json(self, method: str, url: str, **more: Any) -> dict[str, Any]:
+        document: dict[str, Any] = self._good(self._ask(method, url, **more)).json()
+        return document
+
+    def _good(self, answer: httpx.Response) -> httpx.Response:
+        if not answer.is_success:
+            said = _problem(answer).get("detail") or f"The server answered {answer.status_code}."
+            raise Refused(str(said))
+        return answer
+
+    def _ask(self, method: str, url: str, **more: Any) -> httpx.Response:
+        return self._stubbornly(lambda: self._http.request(method, url, **more))
+
+    def _stubbornly(self, ask: Callable[[], httpx.Response]) -> httpx.Response:
+        """A network that breaks and a server that restarts are normal: only time makes us give up."""
+        give_up_at, pause_s = time.monotonic() + self._retry_s, _FIRST_PAUSE_S
+        while True:
+            try:
+                answer = ask()
+                if answer.status_code not in _AGAIN or time.monotonic() + pause_s > give_up_at:
+                    return answer
+            except httpx.TransportError as error:
+                if time.monotonic() + pause_s > give_up_at:
+                    raise ServerAway(f"The server {self.url} does not answer ({error}).") from error
+            time.sleep(pause_s)
+            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+
+def _problem(answer: httpx.Response) -> Mapping[str, Any]:
+    try:
+        body = answer.json()
+    except ValueError:
+        return {}
+    return body if isinstance(body, dict) else {}

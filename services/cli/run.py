@@ -1,0 +1,174 @@
+"""`orthostream run`: a folder of photos in, a finished map and its exports out."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from core.errors import NothingToMap, OrthostreamError
+from services.cli.checkpoints import add_checkpoints, read_gcp
+from services.cli.client import Client
+from services.cli.flight import Photo, find_photos
+from services.cli.mapping import Screen, Tally, fetch, follow, upload_all
+from services.cli.serve import embedded_stack
+
+HOME = ".orthostream"
+
+
+def run(
+    photos: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with the drone's photos.")],
+    out: Annotated[Path, typer.Option(help="Folder for the map and the other results.")],
+    mode: Annotated[
+        str, typer.Option(help="visual: match photos; gnss: position and heading only.")
+    ] = "visual",
+    gcp: Annotated[
+        Path | None, typer.Option(help="Surveyed points (ODM's gcp_list.txt) to check against.")
+    ] = None,
+    max_side: Annotated[
+        int | None, typer.Option(help="Longest side in pixels to work on; all unless set.")
+    ] = None,
+    server: Annotated[
+        str | None, typer.Option(help="URL of a running orthostream; else one is started.")
+    ] = None,
+    pace: Annotated[float | None, typer.Option(help="Photos a second, as if they were flown now.")] = None,
+    keep: Annotated[bool, typer.Option("--keep", help="Leave the map's server up until Ctrl-C.")] = False,
+) -> None:
+    """Map a folder of photos. Run again, it continues where it stopped."""
+    if mode not in ("visual", "gnss"):
+        raise typer.BadParameter("it is visual or gnss", param_hint="--mode")
+    console = Console(stderr=False)
+    found = find_photos(photos)
+    points = read_gcp(gcp) if gcp else None
+    with stop_on_signals(), _service(server, out / HOME, console) as url:
+        client = Client(url)
+        try:
+            mission_id = _mission(client, out / HOME, photos, mode, max_side)
+            map_photos(client, mission_id, found, out, console, 1 / pace if pace else 0.0)
+            if points:
+                add_checkpoints(points, photos, out)
+            summary(out, console, f"{url}/missions/{mission_id}" if keep or server else None)
+            if keep:
+                console.print(f"The map stays up at {url}/missions/{mission_id} until Ctrl-C.")
+                threading.Event().wait()
+        finally:
+            client.close()
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[None]:
+    """SIGTERM ends the block as Ctrl-C does, so that whatever was started is stopped."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _service(server: str | None, home: Path, console: Console) -> Iterator[str]:
+    if server:
+        yield server.rstrip("/")
+        return
+    with embedded_stack(home.absolute(), console.print) as url:
+        console.print(f"Started at {url} (log: {home / 'serve.log'})")
+        yield url
+
+
+def _mission(client: Client, home: Path, photos: Path, mode: str, max_side: int | None) -> str:
+    """The mission of the run before, if it was about the same photos, else a new one."""
+    path = home / "mission.json"
+    wanted: dict[str, Any] = {"photos": str(photos.resolve()), "mode": mode, "max_side": max_side}
+    try:
+        before = json.loads(path.read_text())
+    except (OSError, ValueError):
+        before = {}
+    if {k: before.get(k) for k in wanted} == wanted and client.mission(str(before["mission"])) is not None:
+        return str(before["mission"])
+    folder = photos.resolve()
+    name = folder.parent.name if folder.name in ("images", "photos") else folder.name
+    mission_id = client.create(name or "Mission", mode, max_side)
+    home.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(wanted | {"mission": mission_id}))
+    return mission_id
+
+
+def map_photos(
+    client: Client, mission_id: str, photos: Sequence[Photo], out: Path, console: Console, pace_s: float = 0.0
+) -> None:
+    """Everything from the first upload to the last export. Raises NothingToMap."""
+    tally = Tally()
+    failed: list[BaseException] = []
+
+    def upload() -> None:
+        try:
+            upload_all(client, mission_id, photos, tally, pace_s)
+        except BaseException as error:
+            failed.append(error)
+
+    # A daemon: Ctrl-C need not wait for uploads that a dead network holds up.
+    uploads = threading.Thread(target=upload, name="uploads", daemon=True)
+    with Screen(console, len(photos)) as screen:
+        uploads.start()
+        follow(client, mission_id, tally, screen, lambda _: not uploads.is_alive())
+        if failed:
+            raise failed[0]
+        client.finalise(mission_id)
+        follow(client, mission_id, tally, screen, lambda state: state == "final")
+    fetched = fetch(client, mission_id, out, console)
+    if "mosaic.tif" not in fetched:
+        raise NothingToMap(_why_not(client, mission_id, tally))
+
+
+def _why_not(client: Client, mission_id: str, tally: Tally) -> str:
+    reasons = {f["name"]: f["reason"] for f in client.frames(mission_id, "rejected")} | tally.refused
+    lines = [f"  {name}: {reason}" for name, reason in sorted(reasons.items())[:20]]
+    return "\n".join(["There is no map to make of these photos:", *lines])
+
+
+def summary(out: Path, console: Console, url: str | None) -> None:
+    """A table of what came out."""
+    report = json.loads((out / "report.json").read_text())
+    counts, latency = report["counts"], report.get("latency_s") or {}
+    table = Table(title="Map finished", show_header=False)
+    rows: list[tuple[str, str]] = [
+        ("photos", f"{report['frames']} ({counts['fused']} on the map, {counts['rejected']} rejected)"),
+        ("seconds", _number(report.get("seconds"), "{:.1f}")),
+        (
+            "photos a second",
+            _number(report["frames"] / report["seconds"] if report.get("seconds") else None, "{:.2f}"),
+        ),
+        ("upload to tile", f"p50 {latency.get('p50', '–')} s, p95 {latency.get('p95', '–')} s"),
+        ("reprojection", _number(report.get("reprojection_rms_px"), "{:.2f} px")),
+        ("tiles", str(report.get("tiles"))),
+    ]
+    checked = report.get("checkpoints")
+    if checked:
+        rows.append(
+            ("checkpoints", f"{checked['points']} points, {checked['plane_similarity_m']:.2f} m (similarity)")
+        )
+    for name, value in [*rows, ("map", str(out / "mosaic.tif")), *([("live map", url)] if url else [])]:
+        table.add_row(name, value)
+    console.print(table)
+    for rejected in report["rejected"]:
+        console.print(f"rejected {rejected['name']}: {rejected['reason']}", style="yellow", highlight=False)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value)
+
+
+__all__ = ["OrthostreamError", "map_photos", "run", "stop_on_signals", "summary"]

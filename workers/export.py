@@ -1,0 +1,135 @@
+"""A finished (or growing) map → the files that other programs read."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from core.coverage import mission_gsd_m
+from core.errors import NothingToMap, OrthostreamError
+from core.exports import NamedFrame, footprints_geojson, json_bytes, poses_document, route_csv, write_mosaic
+from core.geometry import PosedFrame, World
+from services.catalog import exports, frames, missions, poses
+from services.catalog.frames import Seen
+from services.catalog.poses import Poses
+from services.report import report
+from services.tables import Export, Mission
+from workers.app import Stopwatch, db, log, settings, stage, store
+from workers.photos import MissionPhotos, PhotoShelf
+
+MEDIA_TYPES = {
+    ".tif": "image/tiff",
+    ".json": "application/json",
+    ".geojson": "application/geo+json",
+    ".csv": "text/csv",
+}
+
+Maker = Callable[[Path, Mission], None]
+shelf = PhotoShelf.of(store, settings.photo_cache_bytes)
+
+
+@stage("export")
+def export(mission_id: str, name: str) -> None:
+    """Wanted → ready or failed."""
+    with _alone(mission_id, name) as alone:
+        if not alone:
+            return  # a large mosaic takes longer than its wake-up is patient
+        with db.read() as tx:
+            wanted = exports.get(tx, mission_id, name)
+            mission = missions.get(tx, mission_id)
+        if wanted is None or wanted.state != "wanted":
+            return
+        clock = Stopwatch()
+        try:
+            key, size = _made(mission, wanted)
+        except Exception as error:
+            if not isinstance(error, OrthostreamError):
+                log.exception("export failed", mission=mission_id, export=name)
+            with db.write() as tx:
+                exports.fail(tx, mission_id, name, wanted.revision, str(error) or type(error).__name__)
+            return
+        with db.write() as tx:
+            media_type = MEDIA_TYPES[Path(name).suffix]
+            exports.finish(tx, mission_id, name, wanted.revision, key, size, media_type)
+            clock.spend(tx, mission_id, "export")
+
+
+@contextmanager
+def _alone(mission_id: str, name: str) -> Iterator[bool]:
+    """Whether nobody else on this machine makes this file right now."""
+    folder = settings.data_dir / "exports"
+    folder.mkdir(exist_ok=True)
+    with (folder / f"{mission_id}-{name}.lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+        else:
+            yield True
+
+
+def _made(mission: Mission, wanted: Export) -> tuple[str, int]:
+    """The file's key in the store, and its bytes."""
+    if wanted.name not in MAKERS:
+        raise OrthostreamError(f"{wanted.name} cannot be made by this version.")
+    with TemporaryDirectory(dir=settings.data_dir / "exports", prefix="making-") as folder:
+        path = Path(folder) / wanted.name
+        MAKERS[wanted.name](path, mission)
+        key = f"missions/{mission.id}/exports/{wanted.revision}-{wanted.generation}/{wanted.name}"
+        store.put_file(key, path)
+        return key, os.stat(path).st_size
+
+
+def _known(mission_id: str) -> tuple[Poses, list[Seen]]:
+    with db.read() as tx:
+        return poses.load(tx, mission_id), list(frames.sightings(tx, mission_id))
+
+
+def _placed(mission: Mission) -> tuple[World, list[NamedFrame]]:
+    """The world and every posed frame. Raises NothingToMap."""
+    known, seen = _known(mission.id)
+    if known.world is None or not known.placed:
+        raise NothingToMap
+    named = [
+        NamedFrame(s.name, known.placed[s.frame_id].posed(known.cameras), s.meta.captured_s)
+        for s in seen
+        if s.frame_id in known.placed
+    ]
+    return known.world, named
+
+
+def _mosaic(path: Path, mission: Mission) -> None:
+    world, named = _placed(mission)
+    drawn: list[PosedFrame] = [n.posed for n in named]
+    gsd_m = mission_gsd_m(drawn, mission.max_side)
+    write_mosaic(path, world, drawn, MissionPhotos(shelf, mission.id, mission.max_side), gsd_m)
+
+
+def _poses(path: Path, mission: Mission) -> None:
+    path.write_bytes(json_bytes(poses_document(*_placed(mission))))
+
+
+def _footprints(path: Path, mission: Mission) -> None:
+    path.write_bytes(json_bytes(footprints_geojson(*_placed(mission))))
+
+
+def _route(path: Path, mission: Mission) -> None:
+    path.write_text(route_csv(*_placed(mission)))
+
+
+def _report(path: Path, mission: Mission) -> None:
+    with db.read() as tx:
+        path.write_bytes(json_bytes(report(tx, mission.id)))
+
+
+MAKERS: dict[str, Maker] = {
+    "mosaic.tif": _mosaic,
+    "poses.json": _poses,
+    "report.json": _report,
+    "footprints.geojson": _footprints,
+    "route.csv": _route,
+}

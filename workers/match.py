@@ -1,0 +1,63 @@
+"""A frame that was read → its matches with neighbours that are there; or pairs that the final solve needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+
+from core.matching import match_pair
+from core.neighbours import Sighting, candidates_of
+from services.catalog import frames, missions, pairs
+from services.catalog.frames import Seen
+from services.catalog.pairs import Key, PairResult
+from services.queue import send
+from workers.app import Stopwatch, db, settings, stage, store
+from workers.photos import PhotoShelf
+
+shelf = PhotoShelf.of(store, settings.photo_cache_bytes)
+
+
+@stage("match")
+def match(mission_id: str, frame_id: str | None, wanted: Sequence[Key] = ()) -> None:
+    """From ready to matched; without a frame id, the `wanted` pairs for the final solve."""
+    clock = Stopwatch()
+    with db.read() as tx:
+        mode = missions.get(tx, mission_id).mode
+        seen = {s.frame_id: s for s in frames.sightings(tx, mission_id)}
+    if frame_id is not None:
+        if frame_id not in seen or seen[frame_id].state != "ready":
+            send("sequence", mission_id)
+            return
+        wanted = neighbours(mission_id, seen, frame_id) if mode == "visual" else []
+    with db.write() as tx:
+        mine = pairs.claim(tx, mission_id, frame_id, [(a, b) for a, b in wanted])
+    results = [computed(mission_id, seen, pair) for pair in mine]
+    with db.write() as tx:
+        pairs.record(tx, mission_id, results)
+        if frame_id is not None:
+            frames.mark_matched(tx, mission_id, frame_id)
+        clock.spend(tx, mission_id, "match")
+    send("sequence", mission_id)
+
+
+def sighting(mission_id: str, seen: Seen) -> Sighting:
+    """A frame as the search for neighbours sees it."""
+    meta = seen.meta
+    words = shelf.words_of(mission_id, seen.frame_id)
+    return Sighting(seen.frame_id, meta.captured_s, seen.name, meta.drone, meta.gps, words)
+
+
+def neighbours(mission_id: str, seen: Mapping[str, Seen], frame_id: str) -> list[Key]:
+    """The pairs of one frame with those that are there."""
+    everyone = {k: sighting(mission_id, s) for k, s in seen.items()}
+    return candidates_of(everyone[frame_id], [s for k, s in everyone.items() if k != frame_id])
+
+
+def computed(mission_id: str, seen: Mapping[str, Seen], pair: Key) -> PairResult:
+    """One pair, matched."""
+    low, high = (shelf.features_of(mission_id, f) for f in pair)
+    cameras = [seen[f].meta.camera() for f in pair]
+    found = match_pair(pair[0], low, pair[1], high, cameras[0], cameras[1])
+    matches = found.to_bytes() if found.accepted else None
+    counts = asdict(found.counts)
+    return PairResult(*pair, found.accepted, found.reason, found.counts.final, counts, matches)

@@ -1,0 +1,157 @@
+"""The map as one sequencer knows it: what is placed where, and which tiles another solution changes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from core import errors
+from core.coverage import moved_px, outline_px, tiles_under
+from core.geometry import PosedFrame
+from core.grid import TileKey, ancestors
+from core.mosaic import MOST_TILES, Layout
+from core.pose_graph import GraphFrame, Solution
+from services.catalog.frames import Seen
+from services.catalog.poses import Placed, Poses, PoseUpdate
+from services.catalog.tiles import Key, TileBox
+
+NEW, GROWN, HEAL = 0, 1, 5
+"""Priorities of dirty tiles: where nothing was shown yet, where a photo came in, where poses moved."""
+SHOWN_MOVE_PX = 0.5
+SHOWN_GAIN = 0.02
+
+
+@dataclass
+class Known:
+    """What the sequencer remembers of a mission between two batches; good as long as `generation` is."""
+
+    generation: int
+    layout: Layout | None
+    solved_frames: int
+    reprojection_rms_px: float = 0.0
+    seen: dict[str, GraphFrame] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, poses: Poses, sightings: Iterable[Seen], rms_px: float | None) -> Known:
+        """From the rows alone, as another sequencer left them."""
+        seen = {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in sightings}
+        return cls(poses.generation, _layout(poses), poses.solved_frames, rms_px or 0.0, seen)
+
+    @property
+    def solution(self) -> Solution | None:
+        """What new frames are placed against; None before anything is placed."""
+        if self.layout is None or not self.layout.frames:
+            return None
+        return Solution(
+            world=self.layout.world,
+            cameras=self.layout.cameras,
+            poses={k: f.pose for k, f in self.layout.frames.items()},
+            unplaced={},
+            reprojection_rms_px=self.reprojection_rms_px,
+        )
+
+    @property
+    def camera_keys(self) -> dict[str, str]:
+        """Frame id → camera key."""
+        return {k: f.meta.camera_key for k, f in self.seen.items()}
+
+
+def _layout(poses: Poses) -> Layout | None:
+    if poses.world is None:
+        return None
+    frames = {k: p.posed(poses.cameras) for k, p in poses.placed.items()}
+    under: dict[str, frozenset[TileKey]] = {}
+    if poses.zoom is not None:
+        under = {k: frozenset(tiles_under(f, poses.world, poses.zoom)) for k, f in frames.items()}
+    return Layout(poses.world, poses.zoom, poses.cameras, frames, under, {})
+
+
+def joined(layout: Layout, solution: Solution, new_ids: Collection[str], keys: Mapping[str, str]) -> Layout:
+    """The layout with new frames in it; those that are there stay as they are."""
+    assert layout.zoom is not None
+    cameras = dict(layout.cameras) | {k: c for k, c in solution.cameras.items() if k not in layout.cameras}
+    frames, under = dict(layout.frames), dict(layout.under)
+    lost = sorted(set(new_ids) - solution.poses.keys())
+    rejected = {k: solution.unplaced.get(k, errors.NotPlaceable.code) for k in lost}
+    for frame_id in sorted(set(new_ids) & set(solution.poses)):
+        camera = cameras[keys[frame_id]]
+        frame = PosedFrame(frame_id, camera, solution.poses[frame_id])
+        frame = replace(frame, gain=_gain_nearby(frame, layout.frames))
+        tiles = frozenset(tiles_under(frame, layout.world, layout.zoom))
+        if 0 < len(tiles) <= MOST_TILES:
+            frames[frame_id], under[frame_id] = frame, tiles
+        else:
+            rejected[frame_id] = "oblique"
+    return replace(layout, cameras=cameras, frames=frames, under=under, rejected=rejected)
+
+
+def _gain_nearby(frame: PosedFrame, others: Mapping[str, PosedFrame]) -> tuple[float, float, float]:
+    """Until the next balance: exposure changes slowly, and the nearest frame saw much the same ground."""
+    same = [f for _, f in sorted(others.items()) if f.camera == frame.camera]
+    if not same:
+        return (1.0, 1.0, 1.0)
+    centers = np.array([f.pose.center for f in same])
+    return same[int(((centers - frame.pose.center) ** 2).sum(1).argmin())].gain
+
+
+def changed(before: Layout | None, after: Layout) -> dict[Key, int]:
+    """Native tiles that look different now, each with its priority."""
+    if before is None or before.zoom is None:
+        return dict.fromkeys(after.cover, NEW)
+    shown = before.cover
+    dirty: dict[Key, int] = {}
+
+    def touch(tiles: Iterable[TileKey], priority: int) -> None:
+        for tile in tiles:
+            dirty[tile] = min(dirty.get(tile, 9), priority)
+
+    for frame_id in sorted(before.frames.keys() | after.frames.keys()):
+        old, new = before.frames.get(frame_id), after.frames.get(frame_id)
+        if new is not None and old is None:
+            touch(after.under[frame_id], GROWN)
+        elif new is None:
+            touch(before.under[frame_id], HEAL)
+        elif old is not None and _looks_other(old, new, before, after):
+            touch(before.under[frame_id] | after.under[frame_id], HEAL)
+    return {tile: NEW if tile not in shown else priority for tile, priority in dirty.items()}
+
+
+def _looks_other(old: PosedFrame, new: PosedFrame, before: Layout, after: Layout) -> bool:
+    if old is new:
+        return False
+    assert after.zoom is not None
+    move = moved_px(outline_px(old, before.world, after.zoom), outline_px(new, after.world, after.zoom))
+    return move > SHOWN_MOVE_PX or float(np.abs(np.subtract(old.gain, new.gain)).max()) > SHOWN_GAIN
+
+
+def everything(layout: Layout, published: Iterable[Key]) -> dict[Key, int]:
+    """All tiles of the layout, and those shown that it does not lead to: they are rendered empty."""
+    cover = layout.cover
+    led_to = cover | set(ancestors(cover))
+    return dict.fromkeys(cover, NEW) | {k: NEW for k in published if TileKey(*k) not in led_to}
+
+
+def update_of(layout: Layout, keys: Mapping[str, str], frame_ids: Collection[str]) -> PoseUpdate:
+    """The rows that say so, of some frames."""
+    assert layout.zoom is not None or not layout.frames
+    placed = [_placed(layout, keys, k) for k in sorted(set(frame_ids) & set(layout.frames))]
+    unplaced = {k: (code, sentence(code)) for k, code in layout.rejected.items()}
+    return PoseUpdate(
+        placed=placed, unplaced=unplaced, cameras=layout.cameras, world=layout.world, zoom=layout.zoom
+    )
+
+
+def _placed(layout: Layout, keys: Mapping[str, str], frame_id: str) -> Placed:
+    frame, tiles = layout.frames[frame_id], layout.under[frame_id]
+    xs, ys = [t.x for t in tiles], [t.y for t in tiles]
+    assert layout.zoom is not None
+    box = TileBox(layout.zoom, min(xs), min(ys), max(xs), max(ys))
+    return Placed(frame_id, keys[frame_id], frame.pose, box, frame.gain)
+
+
+def sentence(code: str) -> str:
+    """What a person is told about an error code of `core.errors`."""
+    kinds: Sequence[type[errors.RejectedFrame]] = errors.RejectedFrame.__subclasses__()
+    return next((str(kind()) for kind in kinds if kind.code == code), str(errors.NotPlaceable()))

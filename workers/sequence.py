@@ -1,0 +1,235 @@
+"""The one owner of a mission: poses its new frames, says which tiles to render, and finishes it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from core.matching import PairMatch
+from core.mosaic import lay_out
+from core.neighbours import Sighting, candidates
+from core.pose_graph import GraphFrame, Solution, solve
+from services.catalog import backlog, frames, missions, pairs, poses, tiles
+from services.catalog.backlog import Backlog
+from services.catalog.pairs import Key as PairKey
+from services.catalog.tiles import Key as TileId
+from services.queue import send
+from services.tables import Mission
+from workers.app import Stopwatch, app, db, log, settings, stage, store
+from workers.lease import held
+from workers.photos import PhotoShelf, Pixels
+from workers.posing import Known, changed, everything, joined, update_of
+
+GROWTH = 1.0
+"""All poses are solved again when the mission has grown so many times since the last time."""
+FEW = 8
+CLAIM_TTL_S = 60.0
+ASK_AGAIN_S = 60.0
+LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 8, 16, 24
+_REMEMBERED = 8
+
+shelf = PhotoShelf.of(store, settings.photo_cache_bytes // 4)
+_known: dict[str, Known] = {}
+_asked: dict[tuple[str, PairKey], float] = {}
+_come_back: dict[str, float] = {}
+
+
+@stage("sequence")
+def sequence(mission_id: str) -> None:
+    """Frames matched → posed, dirty tiles → fuse tasks, finalising → final."""
+    with held(db, mission_id, settings.lease_ttl_s) as epoch:
+        if epoch is None:
+            _come_back_later(mission_id)
+            return
+        while _step(mission_id, epoch):
+            pass
+    # A wake-up that came while the lease was held found it taken and went away.
+    with db.read() as tx:
+        missed = backlog.of(tx, mission_id, CLAIM_TTL_S).matched > 0
+    if missed:
+        send("sequence", mission_id)
+
+
+def _come_back_later(mission_id: str) -> None:
+    """The lease may be a dead owner's: look again when it has run out."""
+    now = time.monotonic()
+    if now > _come_back.get(mission_id, 0.0):
+        _come_back[mission_id] = now + settings.lease_ttl_s
+        app.send_task("sequence", args=[mission_id], queue="sequence", countdown=settings.lease_ttl_s + 0.5)
+
+
+def _step(mission_id: str, epoch: int) -> bool:
+    """One thing that waits; False when there is nothing to do but wait for others."""
+    with db.read() as tx:
+        mission = missions.get(tx, mission_id)
+        desk = backlog.of(tx, mission_id, CLAIM_TTL_S)
+        new = frames.list(tx, mission_id, "matched", limit=10_000) if desk.matched else []
+    if mission.state == "finalising" and not desk.unread and (new or mission.final_generation is None):
+        return _solve_finally(mission, epoch)
+    if new and mission.state != "finalising":
+        _pose(mission, epoch, {f.id for f in new})
+        return True
+    if desk.to_render:
+        return _dispatch(mission, desk)
+    if desk.to_publish and not desk.in_flight:
+        send("publish", mission_id)  # normally the fuse task has: it may have died in between
+        return False
+    if mission.state == "finalising" and not (desk.unread or desk.in_flight or desk.to_publish):
+        with db.write() as tx:
+            missions.finish(tx, mission_id, epoch)
+    return False
+
+
+def _recall(mission: Mission) -> Known:
+    """What this process knows of the mission, read again when another process has written since."""
+    known = _known.get(mission.id)
+    if known is None or known.generation != mission.generation:
+        with db.read() as tx:
+            known = Known.read(
+                poses.load(tx, mission.id), frames.sightings(tx, mission.id), mission.reprojection_rms_px
+            )
+        while len(_known) >= _REMEMBERED:
+            _known.pop(next(iter(_known)))
+        _known[mission.id] = known
+    return known
+
+
+def _learn(mission_id: str, known: Known, new_ids: set[str]) -> None:
+    if new_ids - known.seen.keys():
+        with db.read() as tx:
+            seen = frames.sightings(tx, mission_id)
+        known.seen |= {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in seen}
+
+
+def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
+    """Place what is new, or, when the mission has grown enough, solve all of it again."""
+    clock = Stopwatch()
+    known = _recall(mission)
+    _learn(mission.id, known, new_ids)
+    posed = set(known.layout.frames) if known.layout else set()
+    total = len(posed | new_ids)
+    before, solution = known.layout, known.solution
+    if solution is None or total < FEW or total >= GROWTH * known.solved_frames:
+        # All that were ever read: what came since may tie in a frame that had no place before.
+        solved = _solve_all(mission, known)
+        zoom_now = before.zoom if before is not None else None
+        after = lay_out(solved, known.camera_keys, _thumb(mission.id), mission.max_side, zoom_now)
+        dirty = changed(before, after)
+        rezoomed = before is not None and before.zoom is not None and before.zoom != after.zoom
+        if rezoomed:
+            dirty = everything(after, _published(mission.id))
+        update = update_of(after, known.camera_keys, after.frames.keys())
+        update = replace(update, solved_frames=total, reprojection_rms_px=solved.reprojection_rms_px)
+        known.solved_frames, known.reprojection_rms_px = total, solved.reprojection_rms_px
+    else:
+        assert before is not None
+        matches = _matches(mission.id, new_ids)
+        graph = [known.seen[k] for k in sorted(posed | new_ids)]
+        solved = solve(graph, matches)  # TEMP
+        after = joined(before, solved, new_ids, known.camera_keys)
+        dirty = changed(before, after)
+        update = update_of(after, known.camera_keys, new_ids)
+    with db.write() as tx:
+        generation = poses.save(tx, mission.id, epoch, replace(update, dirty=dirty))
+        clock.spend(tx, mission.id, "pose")
+    known.layout, known.generation = after, generation
+    log.info("posed", mission=mission.id, new=len(new_ids), posed=len(after.frames), dirty=len(dirty))
+
+
+def _solve_all(mission: Mission, known: Known) -> Solution:
+    matches = _matches(mission.id, None) if mission.mode == "visual" else []
+    return solve([known.seen[k] for k in sorted(known.seen)], matches)
+
+
+def _matches(mission_id: str, touching: set[str] | None) -> list[PairMatch]:
+    with db.read() as tx:
+        return [PairMatch.from_bytes(m) for m in pairs.accepted(tx, mission_id, touching)]
+
+
+def _thumb(mission_id: str) -> Callable[[str], Pixels]:
+    return lambda frame_id: shelf.thumb_of(mission_id, frame_id)
+
+
+def _published(mission_id: str) -> Sequence[TileId]:
+    with db.read() as tx:
+        return tiles.keys(tx, mission_id)
+
+
+def _solve_finally(mission: Mission, epoch: int) -> bool:
+    """The canonical solution: a function of the set of photos alone. False while pairs are missing."""
+    clock = Stopwatch()
+    with db.read() as tx:
+        seen = frames.sightings(tx, mission.id)
+    if not seen:  # no photo could be read: there is no map to make
+        with db.write() as tx:
+            missions.finish(tx, mission.id, epoch)
+        return False
+    graph = {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in seen}
+    wanted = _canonical_pairs(mission, list(graph.values()))
+    if not _all_matched(mission.id, wanted):
+        return False
+    matches = [m for m in _matches(mission.id, None) if (m.low, m.high) in wanted]
+    solved = solve(list(graph.values()), matches)
+    keys = {k: f.meta.camera_key for k, f in graph.items()}
+    layout = lay_out(solved, keys, _thumb(mission.id), mission.max_side)
+    update = replace(
+        update_of(layout, keys, layout.frames.keys()),
+        dirty=everything(layout, _published(mission.id)),
+        solved_frames=len(graph),
+        reprojection_rms_px=solved.reprojection_rms_px,
+        final=True,
+    )
+    with db.write() as tx:
+        generation = poses.save(tx, mission.id, epoch, update)
+        clock.spend(tx, mission.id, "solve")
+    _known[mission.id] = Known(generation, layout, len(graph), solved.reprojection_rms_px, graph)
+    log.info("solved finally", mission=mission.id, frames=len(graph), posed=len(layout.frames))
+    return True
+
+
+def _canonical_pairs(mission: Mission, graph: Sequence[GraphFrame]) -> set[PairKey]:
+    if mission.mode != "visual":
+        return set()
+    sightings = [
+        Sighting(
+            f.frame_id,
+            f.meta.captured_s,
+            f.name,
+            f.meta.drone,
+            f.meta.gps,
+            shelf.words_of(mission.id, f.frame_id),
+        )
+        for f in graph
+    ]
+    return set(candidates(sightings))
+
+
+def _all_matched(mission_id: str, wanted: set[PairKey]) -> bool:
+    """Whether all these pairs are computed; asks for those that are not."""
+    with db.read() as tx:
+        missing = sorted(wanted - set(pairs.keys(tx, mission_id, "done")))
+    now = time.monotonic()
+    ask = [p for p in missing if _asked.get((mission_id, p), 0.0) < now]
+    for start in range(0, len(ask), PAIRS_PER_TASK):
+        send("match", mission_id, None, ask[start : start + PAIRS_PER_TASK])
+    _asked.update({(mission_id, p): now + ASK_AGAIN_S for p in ask})
+    if not missing:
+        for key in [k for k in _asked if k[0] == mission_id]:
+            del _asked[key]
+    return not missing
+
+
+def _dispatch(mission: Mission, desk: Backlog) -> bool:
+    """Hand out tiles, as many at a time as there are workers; one task while photos still wait to be read."""
+    busy = desk.unread > settings.workers
+    size = LIVE_TILES if mission.state == "open" else FINAL_TILES
+    room = size * (1 if busy else settings.workers) - desk.in_flight
+    if room <= 0:
+        return False
+    with db.write() as tx:
+        claimed = tiles.claim_dirty(tx, mission.id, room, CLAIM_TTL_S)
+    keys = [(d.z, d.x, d.y) for d in claimed]
+    for start in range(0, len(keys), size):
+        send("fuse", mission.id, keys[start : start + size])
+    return False
