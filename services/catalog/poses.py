@@ -105,7 +105,7 @@ def load(tx: Session, mission_id: str, box: TileBox | None = None) -> Poses:
         generation=row.generation,
         world=World(**row.world) if row.world else None,
         zoom=row.zoom,
-        cameras={key: Camera(**row.cameras[key]) for key in sorted(row.cameras)},
+        cameras={key: _camera(row.cameras[key]) for key in sorted(row.cameras)},
         placed={p.frame_id: p for p in placed},
         solved_frames=row.solved_frames,
         final_generation=row.final_generation,
@@ -129,7 +129,12 @@ def _save_mission(row: Mission, change: PoseUpdate) -> None:
 
 def _camera_json(camera: Camera) -> dict[str, Any]:
     size = {"width": int(camera.width), "height": int(camera.height)}
-    return size | {name: float(getattr(camera, name)) for name in ("f_px", "cx", "cy", "k1", "k2")}
+    lens = {name: float(getattr(camera, name)) for name in ("f_px", "cx", "cy", "k1", "k2")}
+    return size | lens | {"falloff": [float(v) for v in camera.falloff]}
+
+
+def _camera(document: Mapping[str, Any]) -> Camera:
+    return Camera(**{**document, "falloff": tuple(document.get("falloff", ()))})
 
 
 def _upsert(tx: Session, mission_id: str, generation: int, placed: Sequence[Placed]) -> None:
