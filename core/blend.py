@@ -1,4 +1,4 @@
-"""Weighted multiband blending of warped photos (Zhao 2020, 3.4; Bu 2016, Map2DFusion), in integers.
+"""Weighted multiband blending of warped photos (Zhao 2020, 3.4; Bu 2016, Map2DFusion).
 
 The finest bands come from whichever photo weighs most at their own resolution, the lowest one is a weighted
 average of all photos. Instead of Laplacians the difference to the photo's own Gaussian level is carried down
@@ -6,22 +6,25 @@ the pyramid: `blended = photo + up(blended_coarser − photo_coarser)`, which is
 2 × 2 means and double by bilinear interpolation between pixel centres.
 
 Level l of a lattice has `cell_px >> l` pixels a cell; at the last level a pixel is a cell. Colours between
-the levels are int16 in 1/16 grey levels.
+the levels are float32 grey levels: every sum runs over a pixel's few neighbours in one order, so that its
+rounding does not depend on the window.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.warp import INSIDE, Int32, Rgb, compiled
+from core.warp import INSIDE, Int16, Int32, Rgb, compiled
 
 Labels = NDArray[np.int16]
-Fine = NDArray[np.int16]
+Fine = NDArray[np.float32]
+Flat = NDArray[np.float32]
+Flat8 = NDArray[np.uint8]
+Row = NDArray[np.float32]
 
 NOBODY = -1
 
@@ -29,14 +32,14 @@ NOBODY = -1
 class Layer(NamedTuple):
     """One warped photo, whose top-left corner is a cell of the lattice.
 
-    `levels`: its Gaussian levels, finest first, (h >> l, w >> l, 3) uint8. `gain`: (3,) int32, 4096 = 1.
+    `levels`: its Gaussian levels, finest first, (h >> l, w >> l, 3) uint8. `gain`: (3,) float32.
     """
 
     label: int
     row: int
     col: int
     levels: list[Rgb]
-    gain: Int32
+    gain: NDArray[np.float32]
 
 
 def gaussian_levels(warped: Rgb, bands: int) -> list[Rgb]:
@@ -70,14 +73,11 @@ def label_level(
 def blend_level(
     coarse: Fine, coarse_labels: Labels, layers: list[Layer], level: int, labels: Labels, cell_px: int
 ) -> Fine:
-    """The blended colours of `level`, (H, W, 3) int16, from those of the next coarser one."""
-    out = np.zeros((*labels.shape, 3), np.int16)
-    n = cell_px >> level
+    """The blended colours of `level`, (H, W, 3) float32, from those of the next coarser one."""
+    out = np.zeros((*labels.shape, 3), np.float32)
     for layer in layers:
-        change = _changes(coarse, coarse_labels, layer, level + 1, n // 2)
-        _apply(
-            change, layer.levels[level], layer.gain, layer.label, labels, layer.row * n, layer.col * n, out
-        )
+        change = _changes(coarse, coarse_labels, layer, level + 1, cell_px)
+        _apply(change, *_rows(layer, level), layer.label, labels, *_corner(layer, level, cell_px), out)
     return out
 
 
@@ -85,58 +85,60 @@ def blend_finest(
     coarse: Fine, coarse_labels: Labels, layers: list[Layer], labels: Labels, cell_px: int
 ) -> NDArray[np.uint8]:
     """Level 0 as RGBA (H, W, 4) uint8; transparent black where `labels` says nobody."""
-    out = np.zeros((*labels.shape, 4), np.uint8)
+    out = np.zeros(labels.shape, "<u4")
     for layer in layers:
-        change = _changes(coarse, coarse_labels, layer, 1, cell_px // 2)
-        _paint(
-            change,
-            layer.levels[0],
-            layer.gain,
-            layer.label,
-            labels,
-            layer.row * cell_px,
-            layer.col * cell_px,
-            out,
-        )
-    return out
+        change = _changes(coarse, coarse_labels, layer, 1, cell_px)
+        _paint(change, *_rows(layer, 0), layer.label, labels, *_corner(layer, 0, cell_px), out)
+    return out.view(np.uint8).reshape(*labels.shape, 4)
 
 
-def _changes(coarse: Fine, coarse_labels: Labels, layer: Layer, level: int, pixels_per_cell: int) -> Fine:
-    photo = layer.levels[level]
-    top, left = layer.row * pixels_per_cell, layer.col * pixels_per_cell
-    out = np.empty(photo.shape, np.int16)
-    area = np.s_[top : top + photo.shape[0], left : left + photo.shape[1]]
-    _difference(coarse[area], coarse_labels[area], photo, layer.gain, out)
+def _rows(layer: Layer, level: int) -> tuple[Flat8, Row]:
+    """A layer's level as flat rows, three numbers a pixel, and the gain of such a row."""
+    height, width = layer.levels[level].shape[:2]
+    return layer.levels[level].reshape(height, 3 * width), np.tile(layer.gain, width)
+
+
+def _corner(layer: Layer, level: int, cell_px: int) -> tuple[int, int]:
+    """The row and column of a layer's first pixel among all pixels of the level."""
+    return layer.row * (cell_px >> level), layer.col * (cell_px >> level)
+
+
+def _changes(coarse: Fine, coarse_labels: Labels, layer: Layer, level: int, cell_px: int) -> Flat:
+    """How the blended colours differ from one photo's own, as flat rows."""
+    photo, gain = _rows(layer, level)
+    out = np.empty(photo.shape, np.float32)
+    flat = coarse.reshape(len(coarse), -1)
+    _difference(flat, coarse_labels, photo, gain, *_corner(layer, level, cell_px), out)
     return out
 
 
 class Tones(NamedTuple):
-    """Local mean colours of all photos at all knots, (photos, rows, cols, 3) int32 in 1/16 grey levels.
+    """Local mean colours of all photos at all knots, (photos, rows, cols, 3) int16 in 1/16 grey levels.
 
     `own`: as they will be drawn; `even`: as they should be drawn, without the lens's falloff; `detail`: how
     they depart from a much coarser mean.
     """
 
-    own: Int32
-    even: Int32
-    detail: Int32
+    own: Int16
+    even: Int16
+    detail: Int16
 
 
 def retone(labels: Labels, weights: Int32, tones: Tones, tolerance: float) -> Fine:
-    """What each knot's winner lacks to the mean tone of all photos there: (rows, cols, 3) int16.
+    """What each knot's winner lacks to the mean tone of all photos there: (rows, cols, 3) float32.
 
     `weights`: (photos, rows, cols). Photos count the less, the more their detail differs from the winner's,
     in units of `tolerance` grey levels. Exposure and vignetting differ over whole photos and leave no detail;
     but where a tree leans over a road in one photo, its darkness must not haunt the road in another.
     """
-    out = np.zeros((*labels.shape, 3), np.int16)
+    out = np.zeros((*labels.shape, 3), np.float32)
     _retone(labels, weights, *tones, (16 * tolerance) ** 2, out)
     return out
 
 
 @compiled
 def _retone(
-    labels: Labels, weights: Int32, own: Int32, even: Int32, detail: Int32, scale: float, out: Fine
+    labels: Labels, weights: Int32, own: Int16, even: Int16, detail: Int16, scale: float, out: Fine
 ) -> None:
     for y in range(labels.shape[0]):
         for x in range(labels.shape[1]):
@@ -157,7 +159,7 @@ def _retone(
                     blue += say * (even[k, y, x, 2] - here[2])
             lack = (red / total, green / total, blue / total)
             for c in range(3):
-                out[y, x, c] = here[c] - own[winner, y, x, c] + math.floor(lack[c] + 0.5)
+                out[y, x, c] = (here[c] - own[winner, y, x, c] + lack[c]) / 16
 
 
 @compiled
@@ -235,77 +237,115 @@ def _label(
 
 
 @compiled
-def _difference(coarse: Fine, labels: Labels, photo: Rgb, gain: Int32, out: Fine) -> None:
+def _difference(
+    coarse: Flat, labels: Labels, photo: Flat8, gain: Row, top: int, left: int, out: Flat
+) -> None:
+    # Whole arrays and offsets, not slices: these stay contiguous: one compiled version, and vector code.
     for y in range(photo.shape[0]):
-        for x in range(photo.shape[1]):
-            for c in range(3):
-                own = (photo[y, x, c] * gain[c] + 128) >> 8
-                # Where nobody is, nothing pulls: or the mosaic's border would fade into black.
-                out[y, x, c] = coarse[y, x, c] - own if labels[y, x] >= 0 else 0
+        here, own, change = coarse[top + y, 3 * left : 3 * left + photo.shape[1]], photo[y], out[y]
+        for i in range(len(own)):
+            change[i] = here[i] - own[i] * gain[i]
+        # Where nobody is, nothing pulls: or the mosaic's border would fade into black.
+        for x in range(photo.shape[1] // 3):
+            if labels[top + y, left + x] < 0:
+                change[3 * x : 3 * x + 3] = np.float32(0)
 
 
 @compiled
-def _doubled_row(change: Fine, y: int, start: int, stop: int, line: Fine) -> None:
-    """Row y of the change at twice its size (flat colours), for coarse columns start … stop − 1."""
-    height, width = change.shape[0], change.shape[1]
-    near = y // 2
-    far = min(max(near + (y % 2) * 2 - 1, 0), height - 1)
-    for x in range(start, stop):
-        before, after = max(x - 1, 0), min(x + 1, width - 1)
+def _blended_row(
+    change: Flat, photo: Flat8, gain: Row, y: int, start: int, stop: int, scratch: Flat, line: Row
+) -> None:
+    """Row y of photo · gain + change doubled in size, for pixels start … stop − 1, both even, into `line`.
+
+    Rows are flat, three numbers a pixel; plain loops over equal slices, which compile to vector code.
+    """
+    three, sixteenth = np.float32(3), np.float32(1 / 16)
+    height, width = change.shape
+    other = min(max(y // 2 + (y % 2) * 2 - 1, 0), height - 1)
+    first, last = 3 * (start // 2), 3 * (stop // 2)
+    low, high = max(first - 3, 0), min(last + 3, width)
+    near, far, mix = change[y // 2, low:high], change[other, low:high], scratch[0, low + 3 : high + 3]
+    for i in range(len(mix)):
+        mix[i] = three * near[i] + far[i]
+    if first == 0:
+        scratch[0, 0:3] = scratch[0, 3:6]
+    if last == width:
+        scratch[0, width + 3 : width + 6] = scratch[0, width : width + 3]
+    left, here, right = (
+        scratch[0, first:last],
+        scratch[0, first + 3 : last + 3],
+        scratch[0, first + 6 : last + 6],
+    )
+    even, odd = scratch[1, first:last], scratch[2, first:last]
+    for i in range(len(here)):
+        even[i] = (three * here[i] + left[i]) * sixteenth
+        odd[i] = (three * here[i] + right[i]) * sixteenth
+    out, own, by = line[2 * first : 2 * last], photo[y, 2 * first : 2 * last], gain[2 * first : 2 * last]
+    for x in range(len(even) // 3):
         for c in range(3):
-            here = 3 * change[near, x, c] + change[far, x, c]
-            left = 3 * change[near, before, c] + change[far, before, c]
-            right = 3 * change[near, after, c] + change[far, after, c]
-            line[6 * x + c] = (3 * here + left + 8) >> 4
-            line[6 * x + 3 + c] = (3 * here + right + 8) >> 4
+            out[6 * x + c] = even[3 * x + c]
+            out[6 * x + 3 + c] = odd[3 * x + c]
+    for i in range(len(out)):
+        out[i] += own[i] * by[i]
+
+
+@compiled
+def _span(names: NDArray[np.int16], label: int) -> tuple[int, int]:
+    """The even first and last pixel between which a row holds the label; (0, 0) when it does not."""
+    start, stop = 0, len(names)
+    while start < stop and names[start] != label:
+        start += 1
+    while stop > start and names[stop - 1] != label:
+        stop -= 1
+    return (0, 0) if start == stop else (start - start % 2, stop + stop % 2)
 
 
 @compiled
 def _apply(
-    change: Fine, photo: Rgb, gain: Int32, label: int, labels: Labels, top: int, left: int, out: Fine
+    change: Flat, photo: Flat8, gain: Row, label: int, labels: Labels, top: int, left: int, out: Fine
 ) -> None:
-    line = np.empty(3 * photo.shape[1], np.int16)
+    scratch, line = np.empty((3, change.shape[1] + 6), np.float32), np.empty(photo.shape[1], np.float32)
     for y in range(photo.shape[0]):
-        names = labels[top + y, left : left + photo.shape[1]]
-        start, stop = 0, photo.shape[1]
-        while start < stop and names[start] != label:
-            start += 1
-        while stop > start and names[stop - 1] != label:
-            stop -= 1
+        start, stop = _span(labels[top + y, left : left + photo.shape[1] // 3], label)
         if start == stop:
             continue
-        _doubled_row(change, y, start // 2, (stop + 1) // 2, line)
+        _blended_row(change, photo, gain, y, start, stop, scratch, line)
         for x in range(start, stop):
-            if names[x] == label:
+            if labels[top + y, left + x] == label:
                 for c in range(3):
-                    out[top + y, left + x, c] = ((photo[y, x, c] * gain[c] + 128) >> 8) + line[3 * x + c]
+                    out[top + y, left + x, c] = line[3 * x + c]
 
 
 @compiled
 def _paint(
-    change: Fine,
-    photo: Rgb,
-    gain: Int32,
+    change: Flat,
+    photo: Flat8,
+    gain: Row,
     label: int,
     labels: Labels,
     top: int,
     left: int,
-    out: NDArray[np.uint8],
+    out: NDArray[np.uint32],
 ) -> None:
-    line = np.empty(3 * photo.shape[1], np.int16)
+    """Like `_apply`, but rounded and packed as R, G, B and full alpha into little-endian words."""
+    half, dark, bright = np.float32(0.5), np.float32(0), np.float32(255)
+    scratch, line = np.empty((3, change.shape[1] + 6), np.float32), np.empty(photo.shape[1], np.float32)
+    bytes_ = np.empty(photo.shape[1], np.uint8)
     for y in range(photo.shape[0]):
-        names = labels[top + y, left : left + photo.shape[1]]
-        start, stop = 0, photo.shape[1]
-        while start < stop and names[start] != label:
-            start += 1
-        while stop > start and names[stop - 1] != label:
-            stop -= 1
+        start, stop = _span(labels[top + y, left : left + photo.shape[1] // 3], label)
         if start == stop:
             continue
-        _doubled_row(change, y, start // 2, (stop + 1) // 2, line)
-        for x in range(start, stop):
+        _blended_row(change, photo, gain, y, start, stop, scratch, line)
+        values, rounded = line[3 * start : 3 * stop], bytes_[3 * start : 3 * stop]
+        for i in range(len(values)):
+            rounded[i] = np.uint8(np.int32(min(max(values[i], dark), bright) + half))
+        first, last = left + start, left + stop
+        names, words = labels[top + y, first:last], out[top + y, first:last]
+        for x in range(len(names)):
             if names[x] == label:
-                for c in range(3):
-                    value = (((photo[y, x, c] * gain[c] + 128) >> 8) + line[3 * x + c] + 8) >> 4
-                    out[top + y, left + x, c] = min(max(value, 0), 255)
-                out[top + y, left + x, 3] = 255
+                words[x] = (
+                    np.uint32(rounded[3 * x])
+                    | np.uint32(rounded[3 * x + 1]) << np.uint32(8)
+                    | np.uint32(rounded[3 * x + 2]) << np.uint32(16)
+                    | np.uint32(0xFF000000)
+                )

@@ -119,7 +119,7 @@ def render(
     `frames`: at least those of `overlapping`; their order does not matter. Pure: equal input, equal bytes.
     """
     out = np.zeros((grid.height, grid.width, 4), np.uint8)
-    frames = overlapping(grid, world, frames, params)
+    frames = sorted(frames, key=lambda f: f.frame_id)
     lattice = Lattice.covering(grid, world, params.cell_px, PAD_CELLS)
     scene = _Scene.of(lattice, grid.resolution_m(world), frames, photos, params)
     if scene is None:
@@ -137,7 +137,7 @@ class _Scene:
     frames: list[PosedFrame]
     labels: Labels
     weights: Int32
-    retone: NDArray[np.int16]
+    retone: NDArray[np.float32]
 
     @classmethod
     def of(
@@ -230,8 +230,9 @@ def _layer(
         params.cell_px,
         params.sampling == "cubic",
     )
-    gain = np.array([round(4096 * g) for g in frame.gain], np.int32)
-    return Layer(label, int(top), int(left), gaussian_levels(warped, params.bands), gain)
+    return Layer(
+        label, int(top), int(left), gaussian_levels(warped, params.bands), np.array(frame.gain, np.float32)
+    )
 
 
 def _blend(
@@ -241,9 +242,9 @@ def _blend(
     for layer in layers:
         mine = scene.labels == layer.label
         mean = layer.levels[-1]
-        window = np.zeros((*labels.shape, 3), np.int32)
-        window[layer.row :, layer.col :][: mean.shape[0], : mean.shape[1]] = (mean * layer.gain + 128) >> 8
-        colours[mine] += window[mine].astype(np.int16)
+        window = np.zeros((*labels.shape, 3), np.float32)
+        window[layer.row :, layer.col :][: mean.shape[0], : mean.shape[1]] = mean * layer.gain
+        colours[mine] += window[mine]
     for level in range(params.bands - 1, 0, -1):
         finer = label_level(scene.labels, scene.weights, params.cell_px >> level, None, sizes)
         colours = blend_level(colours, labels, layers, level, finer, params.cell_px)

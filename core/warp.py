@@ -2,7 +2,7 @@
 
 A lattice has one knot at the centre of each square cell of `cell_px` pixels, at absolute places of the
 raster's pixel plane. Frames are projected exactly, distortion included, at knots only; between knots the map
-is bilinear in fixed point, so that a pixel's value does not depend on the window that it is computed in.
+is bilinear and exact, so that a pixel's value does not depend on the window that it is computed in.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import ParamSpec, TypeVar, cast
 
 import cv2
@@ -22,6 +23,7 @@ from core.grid import Columns, Grid
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Int16 = NDArray[np.int16]
 Int32 = NDArray[np.int32]
 Rgb = NDArray[np.uint8]
 
@@ -69,16 +71,17 @@ class View:
     """One frame seen from the lattice.
 
     `weight`: (rows, cols) int32, 0 where the frame has no say, `INSIDE` … `FULL` inside of its photo.
-    `own`: (rows, cols, 3) int32, the photo's local mean colour in 1/16 grey levels, gain applied. `even`: the
+    `own`: (rows, cols, 3) int16, the photo's local mean colour in 1/16 grey levels, gain applied. `even`: the
     same, relieved of the lens's falloff too. `detail`: how `own` departs from a much coarser mean.
     """
 
     weight: Int32
-    own: Int32
-    even: Int32
-    detail: Int32
+    own: Int16
+    even: Int16
+    detail: Int16
 
 
+@lru_cache(maxsize=256)
 def intrinsics(camera: Camera) -> NDArray[np.float64]:
     """What the kernels need: f, cx, cy, k1, k2, the largest useful radius², width, height (float64)."""
     corner = max(math.hypot(*ray) for ray in camera.rays(camera.corners())[:, :2])
@@ -111,7 +114,7 @@ def look(
     multiplies the weight. `skirt_px`: how far beyond the photo's edge weights fade out, in its own pixels.
     """
     weight = np.zeros((lattice.rows, lattice.cols), np.int32)
-    own = np.zeros((lattice.rows, lattice.cols, 3), np.int32)
+    own = np.zeros((lattice.rows, lattice.cols, 3), np.int16)
     light, detail = np.zeros_like(own), np.zeros_like(own)
     pose = frame.pose
     _look(
@@ -127,12 +130,21 @@ def look(
         importance,
         min_cos_view,
         skirt_px,
+        _reach_m(frame, skirt_px),
         weight.reshape(-1),
         own.reshape(-1, 3),
         light.reshape(-1, 3),
         detail.reshape(-1, 3),
     )
     return View(weight, own, light, detail)
+
+
+def _reach_m(frame: PosedFrame, skirt_px: float) -> float:
+    """No ground farther than this from the point under the camera is in the picture or its skirt."""
+    height_m = abs(frame.pose.center[2] - frame.pose.ground_h_m)
+    spread = math.sqrt(intrinsics(frame.camera)[5]) + 2 * skirt_px / frame.camera.f_px
+    angle = math.acos(min(max(-frame.pose.world_R_cam[2, 2], -1.0), 1.0)) + math.atan(spread)
+    return height_m * math.tan(angle) if angle < math.radians(85) else math.inf
 
 
 def knots(lattice: Lattice, frame: PosedFrame, camera: Camera, min_cos_view: float) -> Int32:
@@ -170,7 +182,8 @@ def warp(photo: Rgb, lattice_knots: Int32, needed: NDArray[np.bool_], cell_px: i
         left, right = int(wanted[0]), int(wanted[-1]) + 1
         shape = ((bottom - top) * cell_px, (right - left) * cell_px)
         xy, fraction = np.empty((*shape, 2), np.int16), np.empty(shape, np.uint16)
-        _fine_maps(lattice_knots[top : bottom + 2, left : right + 2], cell_px, xy, fraction)
+        around = np.ascontiguousarray(lattice_knots[top : bottom + 2, left : right + 2])
+        _fine_maps(around, cell_px, xy, fraction)
         view = out[top * cell_px : bottom * cell_px, left * cell_px : right * cell_px]
         view[:] = cv2.remap(photo, xy, fraction, method, borderMode=cv2.BORDER_REFLECT)
     return out
@@ -248,17 +261,19 @@ def _look(
     importance: float,
     min_cos_view: float,
     skirt_px: float,
+    reach_m: float,
     weight: Int32,
-    own: Int32,
-    light: Int32,
-    detail: Int32,
+    own: Int16,
+    light: Int16,
+    detail: Int16,
 ) -> None:
     width, height = lens[6], lens[7]
     bare = not falloff.any()
     for k in range(foot.shape[0]):
-        u, v, cos_view = _project(
-            foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m, h_m, world_R_cam, center, lens
-        )
+        x, y = foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m
+        if (x - center[0]) ** 2 + (y - center[1]) ** 2 > reach_m * reach_m:
+            continue
+        u, v, cos_view = _project(x, y, h_m, world_R_cam, center, lens)
         beyond = max(max(-u, u - (width - 1)), max(-v, v - (height - 1)))
         if cos_view < min_cos_view or beyond >= skirt_px:
             continue
@@ -271,41 +286,43 @@ def _look(
         right, down = (u + 0.5) / width, (v + 0.5) / height
         rho2 = 4 * ((u - lens[1]) ** 2 + (v - lens[2]) ** 2) / (width * width + height * height)
         for c in range(3):
-            own[k, c] = light[k, c] = (_sample(fine, right, down, c) * gain[c] + (1 << 23)) >> 24
-            detail[k, c] = own[k, c] - ((_sample(coarse, right, down, c) * gain[c] + (1 << 23)) >> 24)
+            value = (_sample(fine, right, down, c) * gain[c] + (1 << 23)) >> 24
+            around = (_sample(coarse, right, down, c) * gain[c] + (1 << 23)) >> 24
+            own[k, c] = light[k, c] = min(value, 16000)
+            detail[k, c] = min(max(value - around, -16000), 16000)
             if not bare:
                 dim = rho2 * (falloff[3 * c] + rho2 * (falloff[3 * c + 1] + rho2 * falloff[3 * c + 2]))
-                light[k, c] = math.floor(own[k, c] * math.exp(-dim) + 0.5)
+                light[k, c] = min(math.floor(value * math.exp(-dim) + 0.5), 16000)
 
 
 @compiled
 def _fine_maps(
     lattice_knots: Int32, cell_px: int, xy: NDArray[np.int16], fraction: NDArray[np.uint16]
 ) -> None:
-    """Bilinear between knots, all in integers; the last 5 bits go to `fraction` as cv2.remap wants them."""
+    """Bilinear between knots; the last 5 bits go to `fraction` as cv2.remap wants them.
+
+    In float64, where every product and sum of these small integers is exact and vectors are fast.
+    """
     half, cols = cell_px // 2, lattice_knots.shape[1]
-    shift = 1
-    while (1 << shift) < 2 * cell_px:
-        shift += 1
-    row_x, row_y = np.empty(cols, np.int32), np.empty(cols, np.int32)
-    line_x, line_y = np.empty(cols * cell_px, np.int32), np.empty(cols * cell_px, np.int32)
-    down = shift + KNOT_BITS - 5
-    rounding = np.int32(1 << (down - 1))
+    row = np.empty((2, cols), np.float64)
+    line = np.empty((2, cols * cell_px), np.int32)
+    ramp = (2.0 * np.arange(cell_px) + 1.0) / (2 * cell_px)
+    unit = 1.0 / (1 << (KNOT_BITS - 5))
     for y in range(xy.shape[0]):
         k = (y + half) // cell_px
-        part = np.int32(2 * (y + half - k * cell_px) + 1)
-        for j in range(cols):
-            for row, axis in ((row_x, 0), (row_y, 1)):
-                upper, lower = lattice_knots[k, j, axis], lattice_knots[k + 1, j, axis]
-                row[j] = upper + (((lower - upper) * part + cell_px) >> shift)
-        for line, row in ((line_x, row_x), (line_y, row_y)):
+        part = ramp[y + half - k * cell_px]
+        for axis in range(2):
+            for j in range(cols):
+                upper, lower = float(lattice_knots[k, j, axis]), float(lattice_knots[k + 1, j, axis])
+                row[axis, j] = (upper + (lower - upper) * part) * unit + 0.5
             for j in range(cols - 1):
-                start = (np.int32(row[j]) << shift) + rounding
-                slope = row[j + 1] - row[j]
+                start, slope = row[axis, j], row[axis, j + 1] - row[axis, j]
+                cell = line[axis, j * cell_px : (j + 1) * cell_px]
                 for i in range(cell_px):
-                    line[j * cell_px + i] = (start + slope * np.int32(2 * i + 1)) >> down
-        for x in range(xy.shape[1]):
-            qx, qy = line_x[x + half], line_y[x + half]
-            xy[y, x, 0] = qx >> 5
-            xy[y, x, 1] = qy >> 5
-            fraction[y, x] = ((qy & 31) << 5) | (qx & 31)
+                    cell[i] = np.int32(math.floor(start + slope * ramp[i]))
+        along, down = line[0, half : half + xy.shape[1]], line[1, half : half + xy.shape[1]]
+        places, parts = xy[y], fraction[y]
+        for x in range(len(along)):
+            places[x, 0] = along[x] >> 5
+            places[x, 1] = down[x] >> 5
+            parts[x] = ((down[x] & 31) << 5) | (along[x] & 31)
