@@ -146,7 +146,7 @@ def _road_marks(layers: Layers, road: Road, half_m: float) -> None:
     for side in (-1.0, 1.0):
         layers.fill(ribbon(line, 0.08, side * (half_m - 0.3)), (218, 218, 212), 0.2)
     length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(road.line, axis=0).T))))
-    for start in np.arange(0, length[-1], 9.0):
+    for start in np.arange(0, length[-1] - 3.4, 9.0):
         at = np.column_stack(
             [np.interp((start, start + 1.7, start + 3.4), length, road.line[:, i]) for i in range(2)]
         )

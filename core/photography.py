@@ -109,6 +109,8 @@ def expose(picture: GroundPicture, shot: Shot) -> Rgb:
     at = picture.pixels(flight.ground(shot, uv)[:, :2])
     low = np.maximum(np.floor(at.min(0)).astype(int) - 2, 0)
     high = np.minimum(np.ceil(at.max(0)).astype(int) + 3, (picture.columns * TILE_PX, picture.rows * TILE_PX))
+    if not (low < high).all():
+        raise ValueError(f"{shot.name} shows no ground of this flight")
     coarse = (at - low).astype(np.float32).reshape(len(v), len(u), 2)
     full = cv2.resize(coarse, (len(u) * step, len(v) * step), interpolation=cv2.INTER_LINEAR)
     maps = full[step : step + camera.height, step : step + camera.width]
