@@ -422,6 +422,18 @@ class TestFusedFrames:
         assert states(db, mission_id)["f1"] == "fused"
         assert dirty_keys(db, mission_id) == set()
 
+    def test_a_neighbour_that_comes_later_does_not_hide_that_tiles_are_missing(
+        self, db: Database, mission_id: str, matched: list[str], owner: int
+    ) -> None:
+        save(db, mission_id, owner, PoseUpdate(placed=[placed("f0", 0)], dirty=dirty(0)))
+        save(db, mission_id, owner, PoseUpdate(placed=[placed("f1", 1)], dirty=dirty(1)))
+        show(
+            db, mission_id, [render((Z, 0, y), 1) for y in (0, 1)]
+        )  # what f0 shares with f1 is not drawn yet
+        assert states(db, mission_id)["f0"] == "posed"
+        show(db, mission_id, [render((Z, 1, y), 2) for y in (0, 1)])
+        assert states(db, mission_id) == {"f0": "fused", "f1": "posed", "f2": "matched"}
+
     def test_tiles_of_an_older_generation_do_not_show_it(
         self, db: Database, mission_id: str, matched: list[str], owner: int
     ) -> None:
