@@ -34,7 +34,7 @@ class FeatureParams:
     `octave_layers`: SIFT's scales per octave. `thumb_px`: long side of the thumbnail.
     """
 
-    side_px: int = 576
+    side_px: int = 544
     keypoints: int = 1000
     cells: int = 8
     contrast: float = 0.01

@@ -31,11 +31,15 @@ _HEAD = struct.Struct("<4s?6iIHHH")
 class MatchParams:
     """Distances in pixels of a copy whose long side is `side_px`.
 
-    `ratio`: a best descriptor distance above this share of the second best is ambiguous. `turn_bins`: bins
-    of the full circle in the vote. `inlier_px`: a homography's inlier. `foreground_px`: what departs further
-    from every homography moves or stands out (Avola 2019, eq. 2) and is dropped. `window_px`: where guided
-    re-matching looks. `planes`: homographies at most. `min_inliers`: of the first homography.
-    `min_final`: correspondences of an accepted pair. `max_final`: kept at most, spread over the picture.
+    Descriptors: a best distance above `ratio` times the second best is ambiguous; `min_similarity`: cosine
+    of a guided match. Vote: `turn_bins` to the full circle, `min_voted` survivors. Geometry: `epipolar_px`
+    from the epipolar line; `inlier_px` of a homography; `foreground_px`: what departs further from every
+    homography moves or stands out (Avola 2019, eq. 2) and is dropped; `window_px`: where guided re-matching
+    looks. At most `planes` homographies; one after the first is ground only if it departs from the first by
+    less than `slope_departure_px` and is broader than `slope_breadth_px` (standard deviation).
+    Acceptance: `min_inliers` of each homography, `min_final` correspondences, and in the common part of the
+    pictures `min_vote_share` of the voted matches and `min_keypoint_share` of the keypoints. `max_final`
+    correspondences are kept at most, spread over the picture.
     """
 
     side_px: float = 640.0
@@ -50,8 +54,10 @@ class MatchParams:
     slope_breadth_px: float = 30.0
     min_similarity: float = 0.75
     min_voted: int = 10
-    min_inliers: int = 10
-    min_final: int = 14
+    min_inliers: int = 12
+    min_final: int = 16
+    min_vote_share: float = 0.5
+    min_keypoint_share: float = 0.05
     max_final: int = 120
 
 
@@ -157,6 +163,8 @@ def match_pair(
     guided = _guided(a, b, similarity, planes, lines, params)
     if len(guided) < params.min_final:
         return verdict("too_few_inliers", none, *counts, len(guided))
+    if _is_ambiguous(a, b, planes[0], voted, int(on_planes.sum()), len(guided), params):
+        return verdict("too_ambiguous", none, *counts, len(guided))
     final = guided[_spread(a.xy[guided[:, 0]], params.max_final)]
     return verdict("ok", final, *counts, len(guided), len(final))
 
@@ -265,6 +273,32 @@ def _plausible(h: NDArray[Any]) -> bool:
 def _apply(h: NDArray[Any], p: Floats) -> Floats:
     q = np.column_stack((p, np.ones(len(p)))) @ h.T
     return np.asarray(q[:, :2] / q[:, 2:], np.float32)
+
+
+def _is_ambiguous(
+    a: _View,
+    b: _View,
+    ground: NDArray[Any],
+    voted: NDArray[np.intp],
+    on_planes: int,
+    guided: int,
+    params: MatchParams,
+) -> bool:
+    """Whether too little of what both frames should see agrees: rows of crops fit a wrong place at times.
+
+    Of the voted matches inside the overlap that `ground` implies, most must lie on it; and of the keypoints
+    there a fair share must have found its partner (Brown & Lowe 2007, section 3.2, counted both ways).
+    """
+    seen_by_b = _inside(_apply(ground, a.xy), b.xy)
+    seen_by_a = _inside(_apply(np.linalg.inv(ground), b.xy), a.xy)
+    votes = np.count_nonzero(seen_by_b[voted[:, 0]] & seen_by_a[voted[:, 1]])
+    keypoints = min(np.count_nonzero(seen_by_b), np.count_nonzero(seen_by_a))
+    return bool(on_planes < params.min_vote_share * votes or guided < params.min_keypoint_share * keypoints)
+
+
+def _inside(p: Floats, frame: Floats) -> Mask:
+    """Which of the points p (N, 2) lie in the bounding box of the points of a frame (M, 2)."""
+    return np.asarray(((p >= frame.min(0)) & (p <= frame.max(0))).all(1))
 
 
 def _guided(

@@ -1,7 +1,9 @@
-"""The shipped visual vocabulary: many descriptors in, one short vector of a picture's appearance out.
+"""The shipped visual vocabulary: many descriptors in, one vector of a picture's appearance out.
 
-VLAD (Jégou 2010) over descriptors reduced by PCA. The vocabulary lies beside this file as `vocabulary.npz`;
-`train` made it, so it can be made again from any set of descriptors.
+VLAD (Jégou 2010) over descriptors reduced by PCA. The vocabulary lies beside this file as `vocabulary.npz`
+(float16, 10 KB). `train` made it, with seed 0, 32 words and 32 dimensions, from 20,000 descriptors of each
+of four openly licensed flights (park and shore, near-infrared fields, suburb, dirt road) and as many of
+simulated ground.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from io import BytesIO
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 
 Floats = NDArray[np.float32]
 
@@ -29,21 +32,41 @@ class Vocabulary:
         """Descriptors (N, 128) uint8 → (K·D,) float32 of length 1, or zeros when N is 0."""
         reduced = (descriptors.astype(np.float32) - self.mean) @ self.axes
         word = (reduced @ self.centres.T - 0.5 * (self.centres**2).sum(1)).argmax(1)
-        counts = np.bincount(word, minlength=len(self.centres)).astype(np.float32)
         member = (word == np.arange(len(self.centres))[:, None]).astype(np.float32)
-        residual = member @ reduced - counts[:, None] * self.centres
+        residual = member @ reduced - member.sum(1, keepdims=True) * self.centres
         # Each word counts alike (intra-normalisation): a meadow's thousand blades are one kind of thing.
         residual /= np.maximum(np.linalg.norm(residual, axis=1, keepdims=True), 1e-9)
         flat = residual.ravel()
-        length = np.linalg.norm(flat)
-        return np.asarray(flat / length if length > 0 else flat, np.float32)
+        return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-9), np.float32)
+
+    def to_bytes(self) -> bytes:
+        """The file that `from_bytes` reads."""
+        file = BytesIO()
+        parts = {"mean": self.mean, "axes": self.axes, "centres": self.centres}
+        np.savez_compressed(file, allow_pickle=False, **{k: v.astype(np.float16) for k, v in parts.items()})
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Vocabulary:
+        """A vocabulary rounded to half precision."""
+        with np.load(BytesIO(data), allow_pickle=False) as stored:
+            return cls(*(stored[k].astype(np.float32) for k in ("mean", "axes", "centres")))
+
+
+def train(descriptors: NDArray[np.uint8], words: int = 32, dimensions: int = 32, seed: int = 0) -> Vocabulary:
+    """A vocabulary from descriptors (N, 128) uint8 of many different flights."""
+    mean = descriptors.mean(0, dtype=np.float64)
+    centred = descriptors - mean
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    strongest = axes[:, ::-1][:, :dimensions]
+    centres, _ = kmeans2(centred @ strongest, words, iter=40, minit="++", rng=np.random.default_rng(seed))
+    return Vocabulary(mean.astype(np.float32), strongest.astype(np.float32), centres.astype(np.float32))
 
 
 @cache
 def shipped() -> Vocabulary:
     """The vocabulary that comes with the package."""
-    with np.load(BytesIO((files("core") / "vocabulary.npz").read_bytes())) as stored:
-        return Vocabulary(*(stored[k].astype(np.float32) for k in ("mean", "axes", "centres")))
+    return Vocabulary.from_bytes((files("core") / "vocabulary.npz").read_bytes())
 
 
 def appearance(descriptors: NDArray[np.uint8]) -> Floats:

@@ -37,12 +37,17 @@ def blobs(width: int, height: int, centres: np.ndarray, sigma: float) -> Rgb:
 
 @pytest.mark.parametrize("shrink", [1, 2, 4])
 def test_keypoints_are_in_pixels_of_the_original_with_integers_at_pixel_centres(shrink: int) -> None:
-    centres = np.array([[203.3, 250.8], [612.3, 404.1], [900.7, 177.2], [420.4, 690.1], [1010.0, 660.6]])
+    rng = np.random.default_rng(5)
+    grid = np.stack(np.meshgrid(np.arange(8), np.arange(6)), -1).reshape(-1, 2)
+    centres = grid * 130 + 110 + rng.uniform(-20, 20, (48, 2))
     photo = blobs(1152, 864, centres, sigma=14)
     copy = cv2.resize(photo, (1152 // shrink, 864 // shrink), interpolation=cv2.INTER_AREA)
     found = extract(copy, (1152, 864)).keypoints
-    nearest = np.linalg.norm(found[:, None] - centres[None], axis=2).min(0)
-    assert nearest.max() < 0.15
+    nearest = found[np.linalg.norm(found[:, None] - centres[None], axis=2).argmin(0)] - centres
+    hit = np.linalg.norm(nearest, axis=1) < 2
+    assert hit.mean() > 0.8
+    assert np.linalg.norm(nearest[hit], axis=1).max() < 0.5
+    assert np.abs(nearest[hit].mean(0)).max() < 0.05  # without precise upscaling: a quarter pixel of the copy
 
 
 def test_scale_is_in_pixels_of_the_original() -> None:
