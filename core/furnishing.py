@@ -112,6 +112,10 @@ def _beside(place: Array, du_m: float, dv_m: float) -> Array:
 def _pitch(plan: Landscape, parcel: Parcel) -> Iterator[Patch]:
     """A football pitch: mown stripes and white lines."""
     u0, v0, u1, v1 = parcel.rect
+    edge = np.linspace(u0, u1, 30)
+    water = stream_v(plan.params.seed, edge)
+    if ((water > v0 - 8) & (water < v1 + 8)).any():
+        return
     middle, half = np.array([(u0 + u1) / 2, (v0 + v1) / 2]), np.array([u1 - u0, v1 - v0]) / 2 - 6
     for k in range(12):
         lane = _beside(middle, (k - 5.5) / 6 * half[0], 0.0)

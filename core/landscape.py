@@ -193,7 +193,7 @@ def _use(near_m: float, rng: np.random.Generator) -> str:
     if near_m < 125:
         return "lots" if pick < 0.86 else ("orchard" if pick < 0.93 else "pasture")
     if near_m < 190 and pick < 0.5:
-        return ("pitch", "orchard", "lots", "meadow")[int(rng.integers(4))]
+        return ("pitch", "orchard", "lots", "meadow", "wheat", "pasture")[int(rng.integers(6))]
     if pick < 0.14:
         return "forest" if pick < 0.10 else "orchard"
     return CROPS[int(rng.integers(len(CROPS)))]

@@ -51,7 +51,7 @@ def test_monotony_makes_fields_poorer():
     lively, dull = (
         cv2.SIFT_create().detect(
             cv2.cvtColor(
-                Terrain(TerrainParams(3, monotony=m)).raster(-1980, -400, 600, 600, 2 * GSD_M),
+                Terrain(TerrainParams(3, monotony=m)).raster(-2600, -400, 500, 600, GSD_M),
                 cv2.COLOR_RGB2GRAY,
             ),
             None,
