@@ -2,6 +2,7 @@
 
 export type FrameState = "received" | "ready" | "matched" | "posed" | "fused" | "rejected";
 export type MissionState = "open" | "finalising" | "final" | "deleting";
+export type Source = "visual" | "gnss" | "vision-only";
 export type Counts = Record<FrameState, number>;
 
 export interface Progress {
@@ -67,7 +68,7 @@ interface FootprintProperties {
   name: string;
   drone: string;
   state: FrameState;
-  source: "visual" | "gnss" | "vision-only";
+  source: Source;
 }
 
 interface TrackProperties {
@@ -134,6 +135,12 @@ export const api = {
   frames: (id: string): Promise<FramesGeoJson> => request(missionUrl(id, "/frames.geojson")),
   rejected: (id: string): Promise<FramePage> => request(missionUrl(id, "/frames?state=rejected&limit=200")),
   exports: (id: string): Promise<{ exports: ExportDoc[] }> => request(missionUrl(id, "/exports")),
+  /** 200 when it is ready; 202 has it made, and an `export` event says when it is. */
+  wantExport: async (doc: ExportDoc): Promise<"ready" | "wanted"> => {
+    const response = await fetch(doc.state === "failed" ? `${doc.url}?retry=true` : doc.url, { method: "HEAD" });
+    if (!response.ok) throw new Problem(response.status, "export_failed", "This file could not be made.");
+    return response.status === 202 ? "wanted" : "ready";
+  },
   upload: (id: string, file: File, signal: AbortSignal): Promise<{ frames: UploadResult[] }> => {
     const form = new FormData();
     form.append("files", file, file.name);

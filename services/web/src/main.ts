@@ -3,6 +3,7 @@
 import "./style.css";
 
 import { api, Problem } from "./api";
+import { DocsPage } from "./docs";
 import { fill, h } from "./dom";
 import { MissionsPage } from "./missions";
 import { Uploads } from "./uploads";
@@ -46,6 +47,7 @@ function route(): void {
   page = null;
   const match = /^\/missions\/([^/]+)\/?$/.exec(location.pathname);
   if (match?.[1]) void openMission(decodeURIComponent(match[1]));
+  else if (location.pathname === "/docs") page = new DocsPage(root);
   else page = new MissionsPage(root, (id, photos) => {
     uploadsOf(id).add(photos);
     navigate(`/missions/${id}`);

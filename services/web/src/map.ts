@@ -24,8 +24,10 @@ const EMPTY: FramesGeoJson = { type: "FeatureCollection", features: [] };
 const OVERDUE_MS = 10_000;
 const BACKGROUND = "#14181a";
 
+export const SOURCE_COLOURS = { visual: "#e8f1f4", gnss: "#ff8f6b", "vision-only": "#c9a6ff" } as const;
 const SOURCE_COLOUR: ExpressionSpecification = [
-  "match", ["get", "source"], "gnss", "#f2a33a", "vision-only", "#a78bfa", "#7fd4f0",
+  "match", ["get", "source"],
+  "gnss", SOURCE_COLOURS.gnss, "vision-only", SOURCE_COLOURS["vision-only"], SOURCE_COLOURS.visual,
 ];
 // A photo whose pixels are on the map already needs no more than a thin outline.
 const WAITING: ExpressionSpecification = ["!=", ["get", "state"], "fused"];
@@ -47,7 +49,7 @@ function style(): StyleSpecification {
         paint: {
           "line-color": SOURCE_COLOUR,
           "line-width": ["case", WAITING, 1.4, 0.8],
-          "line-opacity": ["case", WAITING, 0.9, 0.32],
+          "line-opacity": ["case", WAITING, 0.9, 0.26],
         },
       },
       {
@@ -104,7 +106,6 @@ export class MissionMap {
       // A tile out of view is asked for again when it comes back (a 304 when nothing changed): a copy
       // kept aside would be shown stale, because only tiles in view are refreshed.
       maxTileCacheSize: 0,
-      refreshExpiredTiles: false,
       fadeDuration: 0,
       transformRequest: (url) => this.stamp(url),
     });

@@ -1,10 +1,10 @@
 /** The page of one mission: the map, its panel, and the stream that keeps both up to date. */
 
-import { api, Problem, type FramesGeoJson, type Mission } from "./api";
+import { api, Problem, type ExportDoc, type FramesGeoJson, type Mission, type Source } from "./api";
 import { fill, h, icon, ICONS } from "./dom";
 import { Live } from "./live";
-import { DRONE_COLOURS, MissionMap } from "./map";
-import { Panel } from "./panel";
+import { DRONE_COLOURS, MissionMap, SOURCE_COLOURS } from "./map";
+import { Panel, type LegendEntry } from "./panel";
 import { dropTarget, tallyText, Uploads } from "./uploads";
 
 const NARROW = matchMedia("(max-width: 760px)");
@@ -34,18 +34,41 @@ function throttled(work: () => Promise<void>): () => void {
   };
 }
 
-function colourDrones(frames: FramesGeoJson): [string, string][] {
+const SOURCE_LABELS = { visual: "from the picture", gnss: "GPS and heading only", "vision-only": "picture without GPS" } as const;
+
+/** The ways of posing in use, unless all photos were posed from the picture, as they should be. */
+function sourceLegend(frames: FramesGeoJson): LegendEntry[] {
+  const used = new Map<Source, number>();
+  for (const { properties } of frames.features) {
+    if (properties.kind === "footprint") used.set(properties.source, (used.get(properties.source) ?? 0) + 1);
+  }
+  if (used.size === 0 || (used.size === 1 && used.has("visual"))) return [];
+  return [...used].sort().map(([source, n]) => [`${n} ${SOURCE_LABELS[source]}`, SOURCE_COLOURS[source]]);
+}
+
+function colourDrones(frames: FramesGeoJson): LegendEntry[] {
   const names = [...new Set(frames.features.map((f) => f.properties.drone))].sort();
   const colours = new Map(names.map((name, i) => [name, DRONE_COLOURS[i % DRONE_COLOURS.length] ?? "#fff"]));
   for (const feature of frames.features) Object.assign(feature.properties, { colour: colours.get(feature.properties.drone) });
   return [...colours];
 }
 
-function emptyState(): HTMLElement {
-  return h("div", { class: "empty", role: "status" },
-    h("div", { class: "radar" }, h("i"), h("i"), h("i"), icon(ICONS.photo)),
-    h("h2", {}, "Waiting for the first photos"),
-    h("p", {}, "Drop photos or a folder anywhere on this page, or let the drones send them. The map grows here while they fly."));
+const OFFLINE = "The server could not be reached. Try again.";
+const EMPTY = ["Waiting for the first photos", "Drop photos or a folder anywhere on this page, or let the drones send them. The map grows here while they fly."] as const;
+const READING = ["Reading the first photos", "They are here and safe. The map begins as soon as one of them says where it belongs."] as const;
+const ALL_REJECTED = ["No photo could be used yet", "The panel says why for each of them. Others may still follow."] as const;
+
+interface EmptyState {
+  root: HTMLElement;
+  title: HTMLElement;
+  text: HTMLElement;
+}
+
+function emptyState(): EmptyState {
+  const title = h("h2");
+  const text = h("p");
+  const radar = h("div", { class: "radar" }, h("i"), h("i"), h("i"), icon(ICONS.photo));
+  return { root: h("div", { class: "empty", role: "status" }, radar, title, text), title, text };
 }
 
 export class MissionPage {
@@ -58,6 +81,8 @@ export class MissionPage {
   private readonly undoDrop: () => void;
   private live: Live | null = null;
   private gone = false;
+  private placed = false;
+  private readonly downloading = new Set<string>();
   private mission: Mission;
   private readonly refreshFrames = throttled(() => this.loadFrames());
   private readonly refreshRejected = throttled(() => this.loadRejected());
@@ -65,14 +90,15 @@ export class MissionPage {
 
   constructor(root: HTMLElement, mission: Mission, private readonly uploads: Uploads) {
     this.mission = mission;
-    this.panel = new Panel(mission.id, {
+    this.panel = new Panel({
       finalise: () => void this.finalise(),
       add: (files) => uploads.add(files),
       toggle: (layer, visible) => this.map.toggle(layer, visible),
       share: () => void this.share(),
+      download: (doc) => void this.download(doc),
     });
     this.followButton = h("button", { class: "follow", hidden: true, onclick: () => this.map.follow() }, icon(ICONS.target), "Show whole map");
-    fill(root, h("main", { class: "mission" }, this.mapBox, this.empty, this.followButton, this.panel.root, this.toast));
+    fill(root, h("main", { class: "mission" }, this.mapBox, this.empty.root, this.followButton, this.panel.root, this.toast));
     this.map = new MissionMap(this.mapBox, mission.id, () => this.padding());
     this.map.onfollow = (following) => (this.followButton.hidden = following);
     this.undoDrop = dropTarget(root, (files) => uploads.add(files));
@@ -102,7 +128,7 @@ export class MissionPage {
   private show(mission: Mission): void {
     this.mission = mission;
     this.panel.setMission(mission);
-    this.empty.hidden = mission.progress.total > 0;
+    this.showEmpty();
     if (mission.zoom !== null) void this.map.showTiles(mission.zoom);
     void this.loadExports();
   }
@@ -120,7 +146,7 @@ export class MissionPage {
         if (progress.state !== this.mission.progress.state) this.refreshMission();
         this.mission.progress = progress;
         this.panel.setProgress(progress);
-        this.empty.hidden = progress.total > 0;
+        this.showEmpty();
         if (rejected) this.refreshRejected();
       },
       exports: () => void this.loadExports(),
@@ -140,7 +166,9 @@ export class MissionPage {
   private async loadFrames(): Promise<void> {
     const frames = await api.frames(this.mission.id);
     if (this.gone) return;
-    this.panel.setDrones(colourDrones(frames));
+    this.panel.setLegend(colourDrones(frames), sourceLegend(frames));
+    this.placed = frames.features.length > 0;
+    this.showEmpty();
     await this.map.showFrames(frames);
   }
 
@@ -151,14 +179,36 @@ export class MissionPage {
 
   private async loadExports(): Promise<void> {
     const { exports } = await api.exports(this.mission.id);
-    if (!this.gone) this.panel.setExports(exports, this.mission.progress.state);
+    if (this.gone) return;
+    const asked = exports.filter((doc) => doc.state === "wanted").map((doc) => doc.name);
+    this.panel.setExports(exports, new Set([...asked, ...this.downloading]), this.mission.progress.revision > 0);
+    // What somebody clicked on here and is made by now goes on by itself.
+    for (const doc of exports) if (doc.state !== "wanted" && this.downloading.delete(doc.name)) void this.download(doc);
+  }
+
+  private async download(doc: ExportDoc): Promise<void> {
+    try {
+      if ((await api.wantExport(doc)) === "ready") h("a", { href: doc.url, download: doc.name }).click();
+      else this.downloading.add(doc.name);
+    } catch (error) {
+      this.say(error instanceof Problem ? (doc.error ?? error.message) : OFFLINE);
+    }
+    void this.loadExports();
+  }
+
+  private showEmpty(): void {
+    const { total, counts } = this.mission.progress;
+    this.empty.root.hidden = this.placed;
+    const [title, text] = total === 0 ? EMPTY : total === counts.rejected ? ALL_REJECTED : READING;
+    this.empty.title.textContent = title;
+    this.empty.text.textContent = text;
   }
 
   private async finalise(): Promise<void> {
     try {
       this.show(await api.finalise(this.mission.id));
     } catch (error) {
-      this.say(error instanceof Problem ? error.message : "The server could not be reached. Try again.");
+      this.say(error instanceof Problem ? error.message : OFFLINE);
     }
   }
 

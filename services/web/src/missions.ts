@@ -48,7 +48,7 @@ export class MissionsPage {
     });
     fill(root, h("main", { class: "home" },
       h("header", { class: "home-head" }, h("a", { class: "brand", href: "/", "data-route": true }, h("i", { class: "mark" }), "Orthostream"),
-        h("a", { class: "docs", href: "/docs" }, "API")),
+        h("a", { class: "docs", href: "/docs", "data-route": true }, "API")),
       h("section", { class: "hero" },
         h("h1", {}, "Maps that grow while the drones fly"),
         h("button", { class: "dropzone", type: "button", onclick: () => file.click() }, icon(ICONS.upload),

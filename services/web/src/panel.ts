@@ -1,6 +1,6 @@
 /** The mission's panel: what came in, what is on the map, what was refused and why, what can be taken away. */
 
-import { missionUrl, type Counts, type ExportDoc, type Frame, type Mission, type MissionState, type Progress } from "./api";
+import { type Counts, type ExportDoc, type Frame, type Mission, type MissionState, type Progress } from "./api";
 import { fill, h, icon, ICONS, text } from "./dom";
 import { bytes, count, seconds } from "./format";
 
@@ -25,6 +25,15 @@ export interface PanelActions {
   add(files: File[]): void;
   toggle(layer: "footprint" | "track", visible: boolean): void;
   share(): void;
+  download(doc: ExportDoc): void;
+}
+
+export type LegendEntry = [label: string, colour: string];
+
+function legendEntry([label, colour]: LegendEntry): HTMLElement {
+  const swatch = h("i");
+  swatch.style.background = colour;
+  return h("li", {}, swatch, label);
 }
 
 /** How many photos have come at least so far along the chain. */
@@ -32,6 +41,12 @@ export function reached(counts: Counts): { matched: number; posed: number; fused
   const fused = counts.fused;
   const posed = counts.posed + fused;
   return { matched: counts.matched + posed, posed, fused };
+}
+
+function exportNote(doc: ExportDoc, wanted: boolean): string {
+  if (wanted) return "being made…";
+  if (doc.state === "failed") return doc.error ?? "failed";
+  return doc.state === "ready" && doc.size_bytes !== null ? bytes(doc.size_bytes) : "";
 }
 
 function stat(label: string, hint: string): { root: HTMLElement; value: HTMLElement } {
@@ -65,12 +80,13 @@ export class Panel {
   private readonly rejected = h("details", { class: "section", hidden: true });
   private readonly downloads = h("ul", { class: "downloads" });
   private readonly drones = h("ul", { class: "legend" });
+  private readonly sources = h("ul", { class: "legend" });
   private readonly uploadNote = h("p", { class: "note", hidden: true, role: "status" });
   private readonly finalise: HTMLButtonElement;
   private readonly finaliseHint = h("p", { class: "note" });
-  private lastDrones = "";
+  private lastLegend = "";
 
-  constructor(private readonly missionId: string, private readonly actions: PanelActions) {
+  constructor(private readonly actions: PanelActions) {
     this.finalise = h("button", { class: "primary", onclick: () => actions.finalise() }, icon(ICONS.check), "Finalise map");
     this.rejected.append(h("summary", {}, "Rejected photos", this.rejectedCount), this.rejectedList);
     this.root = h("aside", { class: "panel", "aria-label": "Mission" }, this.head(), this.body());
@@ -107,7 +123,7 @@ export class Panel {
       h("dl", { class: "stages" }, ...Object.values(this.stages).map((s) => s.root)),
       h("dl", { class: "figures" }, ...Object.values(this.figures).map((s) => s.root)),
       h("section", { class: "section" }, h("h2", {}, "Layers"),
-        this.switch("Photo footprints", "footprint"), this.switch("Flight tracks", "track"), this.drones),
+        this.switch("Photo footprints", "footprint"), this.sources, this.switch("Flight tracks", "track"), this.drones),
       this.rejected,
       h("section", { class: "section" }, h("h2", {}, "Downloads"), this.downloads),
       h("section", { class: "section actions" }, choose, input, this.finalise, this.uploadNote, this.finaliseHint),
@@ -167,7 +183,7 @@ export class Panel {
     this.finalise.disabled = state !== "open" || good === 0;
     this.finalise.hidden = state === "final";
     text(this.finaliseHint, {
-      open: good ? "Finalising solves all photos together and makes the downloads. More photos can still follow." : "",
+      open: good ? "Finalising solves all photos together and draws the best map they give. More can still follow." : "",
       finalising: "Solving all photos together and drawing the final map…",
       final: "This map is final. Adding photos opens it again.",
       deleting: "This mission is being deleted.",
@@ -180,37 +196,25 @@ export class Panel {
     fill(this.rejectedList, ...frames.map((f) => h("li", {}, h("strong", {}, f.name), h("span", {}, f.reason ?? f.code ?? ""))));
   }
 
-  setExports(exports: ExportDoc[], state: MissionState): void {
-    if (!exports.length || state === "open") {
-      fill(this.downloads, h("li", { class: "note" }, "Ready when the map is final."));
-      return;
-    }
-    fill(this.downloads, ...exports.map((doc) => this.download(doc, state)));
+  setExports(exports: ExportDoc[], wanted: ReadonlySet<string>, onMap: boolean): void {
+    if (!onMap) fill(this.downloads, h("li", { class: "note" }, "As soon as there is something on the map."));
+    else fill(this.downloads, ...exports.map((doc) => this.download(doc, wanted.has(doc.name))));
   }
 
-  private download(doc: ExportDoc, state: MissionState): HTMLElement {
+  private download(doc: ExportDoc, wanted: boolean): HTMLElement {
     const [title, hint] = EXPORT_TITLES[doc.name] ?? [doc.name, ""];
-    const label = [h("span", { class: "name" }, title, h("small", {}, hint)), h("span", { class: "size" }, this.exportNote(doc, state))];
-    if (state !== "final" || doc.state === "failed") return h("li", {}, h("span", { class: "download off" }, ...label));
-    return h("li", {}, h("a", { class: "download", href: missionUrl(this.missionId, `/exports/${doc.name}`), download: doc.name }, ...label, icon(ICONS.download)));
+    return h("li", {},
+      h("button", { class: "download", disabled: wanted, onclick: () => this.actions.download(doc) },
+        h("span", { class: "name" }, title, h("small", {}, hint)), h("span", { class: "size" }, exportNote(doc, wanted)), icon(ICONS.download)));
   }
 
-  private exportNote(doc: ExportDoc, state: MissionState): string {
-    if (doc.state === "failed") return doc.error ?? "failed";
-    if (state !== "final") return "waiting for the final map";
-    if (doc.state === "wanted") return "being made…";
-    return doc.size_bytes === null ? "" : bytes(doc.size_bytes);
-  }
-
-  setDrones(drones: [name: string, colour: string][]): void {
-    const now = JSON.stringify(drones);
-    if (now === this.lastDrones) return;
-    this.lastDrones = now;
-    fill(this.drones, ...drones.map(([name, colour]) => {
-      const swatch = h("i");
-      swatch.style.background = colour;
-      return h("li", {}, swatch, name);
-    }));
+  /** Which colour is which drone, and which way of posing where photos were not all posed the same way. */
+  setLegend(drones: LegendEntry[], sources: LegendEntry[]): void {
+    const now = JSON.stringify([drones, sources]);
+    if (now === this.lastLegend) return;
+    this.lastLegend = now;
+    fill(this.drones, ...drones.map(legendEntry));
+    fill(this.sources, ...sources.map(legendEntry));
   }
 
   setUploads(note: string): void {
