@@ -19,7 +19,7 @@ from typing import Any
 
 import psutil
 
-PROGRAM = [sys.executable, "-m", "services.cli"]
+PROGRAM = [str(Path(sys.executable).with_name("orthostream"))]
 
 
 def label(process: psutil.Process) -> str:
@@ -104,10 +104,9 @@ def simulated(options: argparse.Namespace) -> dict[str, Any]:
     shutil.rmtree(photos, ignore_errors=True)
     simulate = [*PROGRAM, "simulate", "--out", str(photos), *options.simulate.split()]
     subprocess.run(simulate, check=True, stdout=subprocess.DEVNULL)
-    figures = {"flight": f"simulated {options.simulate}", "cores": options.cores} | run(photos, out, options)
-    truth = next(photos.rglob("truth.tif"))
-    area = truth.with_name("truth.json")
-    return figures | scored(options.tools, "score_mosaic.py", out / "mosaic.tif", truth, "--area", area)
+    figures = {"flight": f"simulated {options.simulate}", "cores": options.cores} | run(photos / "images", out, options)
+    truth = ("--area", photos / "truth.json")
+    return figures | scored(options.tools, "score_mosaic.py", out / "mosaic.tif", photos / "truth.tif", *truth)
 
 
 def main() -> None:
