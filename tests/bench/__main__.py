@@ -104,9 +104,13 @@ def simulated(options: argparse.Namespace) -> dict[str, Any]:
     shutil.rmtree(photos, ignore_errors=True)
     simulate = [*PROGRAM, "simulate", "--out", str(photos), *options.simulate.split()]
     subprocess.run(simulate, check=True, stdout=subprocess.DEVNULL)
-    figures = {"flight": f"simulated {options.simulate}", "cores": options.cores} | run(photos / "images", out, options)
+    figures = {"flight": f"simulated {options.simulate}", "cores": options.cores} | run(
+        photos / "images", out, options
+    )
     truth = ("--area", photos / "truth.json")
-    return figures | scored(options.tools, "score_mosaic.py", out / "mosaic.tif", photos / "truth.tif", *truth)
+    return figures | scored(
+        options.tools, "score_mosaic.py", out / "mosaic.tif", photos / "truth.tif", *truth
+    )
 
 
 def main() -> None:
