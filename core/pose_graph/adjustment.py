@@ -13,8 +13,8 @@ from core.pose_graph.elimination import Border, solve_blocks
 from core.pose_graph.priors import Priors, add_priors
 from core.pose_graph.residuals import Edges, Normal, State, linearise, retract
 
-# What a step must gain of the cost to be worth another one.
-MIN_GAIN = 1e-4
+# A step of less than this share of the height above ground (at the 95th percentile) moves no pixel of the map.
+SETTLED = 1e-4
 HELD = 1e12
 
 
@@ -45,9 +45,13 @@ def adjust(
     sigma_px: Array,
     scale: float,
     steps: int,
+    min_gain: float,
     held: NDArray[np.bool_] | None = None,
 ) -> Adjusted:
-    """Minimise from `start`. `sigma_px` (C,), `scale` of the Cauchy loss in sigmas; `held` (N,) frames stay."""
+    """Minimise from `start`. `sigma_px` (C,), `scale` of the Cauchy loss in sigmas; `held` (N,) frames stay.
+
+    Stops after `steps` linearisations, or when a step gains less than `min_gain` of the cost.
+    """
     state, damping = start, 1e-4
     normal = normal_equations(edges, priors, state, sigma_px, scale)
     ordering: gtsam.Ordering | None = None
@@ -64,8 +68,9 @@ def adjust(
         done += 1
         if np.isfinite(tried.cost) and tried.cost < normal.cost:
             gain = (normal.cost - tried.cost) / normal.cost
+            moved = np.linalg.norm(trial.t - state.t, axis=1) / np.maximum(trial.t[:, 2] - trial.h, 0.1)
             state, normal, damping = trial, tried, damping * 0.1
-            if gain < MIN_GAIN:
+            if gain < min_gain or np.percentile(moved, 95) < SETTLED:
                 break
         else:
             damping = max(damping * 30, 1e-4)
@@ -89,5 +94,6 @@ def _step(
     if held is not None:
         frame[held] = np.eye(len(diagonal)) * HELD
         rhs, cross = np.where(held[:, None], 0.0, rhs), np.where(held[:, None, None], 0.0, cross)
-        pair = np.where(held[edges.pairs].any(1)[:, None, None], 0.0, pair)
+        still = held[edges.pairs[:, 0]] | held[edges.pairs[:, 1]]
+        pair = np.where(still[:, None, None], 0.0, pair)
     return solve_blocks(frame, edges.pairs, pair, rhs, Border(cross, border, normal.border_rhs), ordering)

@@ -24,6 +24,8 @@ ComplexArray = NDArray[np.complex128]
 MODEL_ERROR = 0.03
 POINTS_WORTH = 4.0
 ROUNDS = 8
+MIN_ROUNDS = 3
+SETTLED = 0.003
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +109,13 @@ def average(
         if solved is None:
             break
         x, _, ordering = solved
+        before = error
         z = x[:, 0] + 1j * x[:, 1]
         # a frame whose pairs were all turned down tends to z = 0: never let that raise the pairs' weight
         height = np.clip(np.abs(z), 0.3 * np.median(np.abs(z)), 3 * np.median(np.abs(z))).clip(1e-3)
         error = _pair_error(x, i, j, m) / np.sqrt(height[i] * height[j])
+        if turn >= MIN_ROUNDS and float(np.abs(error - before).max(initial=0.0)) < SETTLED:
+            break
         bend = MODEL_ERROR * max(1.0, 4.0 * 0.6**turn)
         edge_weight = 1 / (1 + (error / bend) ** 2) ** 2
         if known.any():

@@ -9,6 +9,7 @@ import numpy as np
 from core.geometry import Array, Camera, Pose
 from core.pose_graph.attitude import rotation_of
 from core.pose_graph.model import PoseParams
+from core.pose_graph.residuals import IntArray
 from core.pose_graph.start import expected_down
 from core.pose_graph.survey import Survey
 
@@ -16,7 +17,7 @@ NEAREST = 5
 
 
 def gnss_poses(
-    s: Survey, rows: Array, placed: Mapping[str, Pose], offset: Array, params: PoseParams
+    s: Survey, rows: IntArray, placed: Mapping[str, Pose], offset: Array, params: PoseParams
 ) -> dict[int, Pose]:
     """Poses of the frames `rows` that have GPS, from it, the heading and the ground below their `placed`
     neighbours; `offset` (D,) corrects the yaw by drone, NaN = unknown."""

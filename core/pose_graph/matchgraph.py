@@ -31,37 +31,39 @@ def edges_of(
         for m in matches
         if m.accepted and m.low in index and m.high in index and len(m.uv_low) >= params.min_points
     }
-    pairs, uv, counts = [], [], []
-    for key in sorted(chosen):
-        m = chosen[key]
-        i, j = index[m.low], index[m.high]
-        first, second = cameras[camera[i]], cameras[camera[j]]
-        low, high = np.asarray(m.uv_low, float), np.asarray(m.uv_high, float)
-        keep = spread(low, first, params.points_per_edge)
-        uv.append(np.column_stack((low[keep] - (first.cx, first.cy), high[keep] - (second.cx, second.cy))))
-        pairs.append((i, j))
-        counts.append(len(keep))
-    size = np.array(counts, np.int64)
-    return Edges(
-        np.array(pairs, np.int64).reshape(-1, 2),
-        np.concatenate(([0], np.cumsum(size))).astype(np.int64),
-        np.concatenate(uv) if uv else np.zeros((0, 4)),
-        np.minimum(1.0, params.independent_points / np.maximum(size, 1)),
-        camera,
-    )
+    ordered = [chosen[key] for key in sorted(chosen)]
+    pairs = np.array([(index[m.low], index[m.high]) for m in ordered], np.int64).reshape(-1, 2)
+    count = np.array([len(m.uv_low) for m in ordered], np.int64)
+    edge = np.repeat(np.arange(len(ordered)), count)
+    axis = np.array([(c.cx, c.cy) for c in cameras])[camera]
+    size = np.array([(c.width, c.height) for c in cameras], float)[camera]
+    low = np.concatenate([m.uv_low for m in ordered]) if ordered else np.zeros((0, 2))
+    high = np.concatenate([m.uv_high for m in ordered]) if ordered else np.zeros((0, 2))
+    keep = spread(low / size[pairs[edge, 0]], edge, params.points_per_edge)
+    edge, uv = edge[keep], np.column_stack((low[keep], high[keep])).astype(float)
+    uv -= np.column_stack((axis[pairs[edge, 0]], axis[pairs[edge, 1]]))
+    kept = np.bincount(edge, minlength=len(ordered))
+    starts = np.concatenate(([0], np.cumsum(kept))).astype(np.int64)
+    return Edges(pairs, starts, uv, np.minimum(1.0, params.independent_points / np.maximum(kept, 1)), camera)
 
 
-def spread(uv: Array, camera: Camera, limit: int) -> NDArray[np.int64]:
-    """Indices of at most `limit` of the points (M, 2), taken in turn from the cells of a grid, ascending."""
-    if len(uv) <= limit:
-        return np.arange(len(uv))
-    cell = np.clip(uv / (camera.width, camera.height) * GRID, 0, GRID - 1).astype(np.int64) @ (1, GRID)
-    order = np.argsort(cell, kind="stable")
-    ranked = cell[order]
-    begin = np.searchsorted(ranked, ranked)
-    turn = np.empty(len(uv), np.int64)
-    turn[order] = np.arange(len(uv)) - begin
-    return np.sort(np.lexsort((np.arange(len(uv)), cell, turn))[:limit])
+def spread(where: Array, group: IntArray, limit: int) -> NDArray[np.int64]:
+    """Indices of at most `limit` points of each group, taken in turn from the cells of a grid, ascending.
+
+    `where`: (M, 2) in the unit square. `group`: (M,) ascending from 0.
+    """
+    cell = np.clip(where * GRID, 0, GRID - 1).astype(np.int64) @ (1, GRID)
+    block = group * GRID * GRID + cell
+    order = np.argsort(block, kind="stable")
+    ranked = block[order]
+    fresh = np.concatenate(([True], ranked[1:] != ranked[:-1])) if len(ranked) else np.zeros(0, bool)
+    begin = np.maximum.accumulate(np.where(fresh, np.arange(len(ranked)), 0))
+    turn = np.empty(len(block), np.int64)
+    turn[order] = np.arange(len(ranked)) - begin
+    # within a group: first points of all cells, then second ones …
+    queue = np.lexsort((turn, group))
+    first = np.searchsorted(group, group)
+    return np.sort(queue[np.arange(len(queue)) - first < limit])
 
 
 def submaps(n: int, pairs: IntArray, ranks: Sequence[object]) -> IntArray:

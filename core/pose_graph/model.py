@@ -27,11 +27,14 @@ class PoseParams:
     `sigma_of_f`: standard deviation of a correspondence on the ground plane, as a share of the focal length.
     `robust_scale`: where the Cauchy loss starts to bend, in standard deviations.
     `wrong_edge`: an edge whose median residual exceeds this many standard deviations (and this many
-    times the median edge) is taken for a wrong match.
+    times the median edge) is taken for a wrong match. `…_start_…`: before a mission shows how good its GPS and
+    gimbal are; `…_floor_…`: the best that is believed of them afterwards. `min_downward`: cosine of the steepest
+    tilt by the gimbal that still makes a map photo; `oblique_ratio`: the furthest corner, in heights.
     """
 
-    points_per_edge: int = 48
-    independent_points: float = 16.0
+    points_per_edge: int = 32
+    independent_points: float = 2.0
+    coarse_points: int = 12
     min_points: int = 8
     sigma_of_f: float = 1.5e-3
     robust_scale: float = 2.0
@@ -40,17 +43,23 @@ class PoseParams:
     gps_floor_m: float = 0.05
     altitude_sigma_m: float = 15.0
     ground_step_sigma_m: float = 3.0
-    tilt_sigma_rad: float = 0.15
-    gimbal_sigma_rad: float = 0.05
+    gps_learnt_floor_m: float = 0.5
+    altitude_learnt_floor_m: float = 0.5
+    min_frames_to_learn: int = 8
+    tilt_start_rad: float = 0.3
+    tilt_floor_rad: float = 0.03
+    gimbal_start_rad: float = 0.05
+    gimbal_sigma_rad: float = 0.006
     yaw_sigma_rad: float = 0.5
     height_log_sigma: float = 0.4
-    focal_log_sigma: float = 0.01
+    focal_log_sigma: float = 0.005
     k1_sigma: float = 0.1
     k2_sigma: float = 0.03
     lag_sigma_s: float = 0.3
     assumed_height_m: float = 60.0
     far_m: float = 50_000.0
     oblique_ratio: float = 10.0
+    min_downward: float = 0.4
     self_calibrate: bool = True
     min_frames_to_calibrate: int = 8
     coarse_steps: int = 6

@@ -44,6 +44,17 @@ class Edges:
         """The number of image pairs."""
         return len(self.pairs)
 
+    def thinned(self, limit: int) -> Edges:
+        """The same pairs with at most `limit` points each, every k-th of them, and their weight made up for."""
+        counts = np.diff(self.starts)
+        rank = np.arange(len(self.uv)) - np.repeat(self.starts[:-1], counts)
+        wide = np.repeat(counts, counts)
+        kept = np.minimum(wide, limit)
+        keep = (rank * kept) // wide != ((rank - 1) * kept) // wide
+        size = np.minimum(counts, limit)
+        starts = np.concatenate(([0], np.cumsum(size))).astype(np.int64)
+        return Edges(self.pairs, starts, self.uv[keep], self.weight * counts / size, self.camera)
+
     def subset(self, keep: NDArray[np.bool_]) -> Edges:
         """The same edges without those whose flag in `keep` (E,) is false."""
         counts = np.diff(self.starts)
@@ -96,17 +107,20 @@ def rotations(omega: Array) -> Array:
 
 def _observe(
     d0: float, d1: float, e0: float, e1: float,
-    Ri: Array, ti: Array, hi: float, li: Array, Rj: Array, tj: Array, lj: Array,
-    i0: int, j0: int, ci: int, cj: int, J: Array, r: Array,
+    Ri: Array, ti: Array, hi: float, li: Array, Rj: Array, tj: Array, lj: Array, J: Array, out: Array,
 ) -> bool:  # fmt: skip
-    """One directed residual r (2,) and its Jacobian J (2, 20): i0, j0, ci, cj are the columns of the two frames
-    and cameras. False when the ray misses the ground."""
+    """One directed residual and its Jacobian, out = 2 rows of J (2, 16) and 2 of `out`; False when the ray
+    misses the ground.
+
+    The columns of J are those that differ: ω_i (3), ω_j (3), the shift east and north, the slope of the ray, up,
+    lens i (3), lens j (3); `_spread_columns` makes the unknowns' columns of them.
+    """
     # undistort: r_d = r (1 + k1 r² + k2 r⁴), by Newton
     f, k1, k2 = li[0], li[1], li[2]
     xd, yd = d0 / f, d1 / f
     rd = (xd * xd + yd * yd) ** 0.5
     rr = rd
-    for _ in range(6):
+    for _ in range(4):
         q = rr * rr
         rr -= (rr * (1 + k1 * q + k2 * q * q) - rd) / max(1 + 3 * k1 * q + 5 * k2 * q * q, 0.2)
     r2 = rr * rr
@@ -130,116 +144,157 @@ def _observe(
     w2 = u * u + v * v
     sj = 1 + m1 * w2 + m2 * w2 * w2
     mj = 2 * (m1 + 2 * m2 * w2)
-    r[0], r[1] = g * sj * u - e0, g * sj * v - e1
+    out[0], out[1] = g * sj * u - e0, g * sj * v - e1
     # d(pixel)/d(q) = g (sj I + mj y yᵀ) [I | −y] / q2
     a00, a01, a11 = g * (sj + mj * u * u) / q2, g * mj * u * v / q2, g * (sj + mj * v * v) / q2
-    a02, a12 = -(a00 * u + a01 * v), -(a01 * u + a11 * v)
     for k in range(2):
-        p0, p1, p2 = (a00, a01, a02) if k == 0 else (a01, a11, a12)
+        p0, p1 = (a00, a01) if k == 0 else (a01, a11)
+        p2 = -(p0 * u + p1 * v)
         # d(pixel)/d(p), world
         w0 = p0 * Rj[0, 0] + p1 * Rj[0, 1] + p2 * Rj[0, 2]
         w1 = p0 * Rj[1, 0] + p1 * Rj[1, 1] + p2 * Rj[1, 2]
-        wz = p0 * Rj[2, 0] + p1 * Rj[2, 1] + p2 * Rj[2, 2]
-        # of the ray: the ground point moves by λ (da − a·da_z/a_z)
-        m0, m1_, m2_ = lam * w0, lam * w1, -lam * (w0 * bx + w1 * by)
-        c0 = m0 * Ri[0, 0] + m1_ * Ri[1, 0] + m2_ * Ri[2, 0]
-        c1 = m0 * Ri[0, 1] + m1_ * Ri[1, 1] + m2_ * Ri[2, 1]
-        c2 = m0 * Ri[0, 2] + m1_ * Ri[1, 2] + m2_ * Ri[2, 2]
-        J[k, i0], J[k, i0 + 1], J[k, i0 + 2] = c2 * y - c1, c0 - c2 * x, c1 * x - c0 * y
-        J[k, i0 + 3], J[k, i0 + 4] = w0, w1
         slope = w0 * bx + w1 * by
-        J[k, i0 + 5] = -slope
-        J[k, i0 + 6] = slope + wz
-        J[k, j0], J[k, j0 + 1], J[k, j0 + 2] = p1 * q2 - p2 * q1, p2 * q0 - p0 * q2, p0 * q1 - p1 * q0
-        J[k, j0 + 3], J[k, j0 + 4], J[k, j0 + 5] = -w0, -w1, -wz
-        J[k, j0 + 6] = 0.0
-        # lens of the first frame: every parameter scales the ray's (x, y)
-        along = (c0 * x + c1 * y) / (s + 2 * (k1 + 2 * k2 * r2) * r2)
-        J[k, ci], J[k, ci + 1], J[k, ci + 2] = -along * s, -along * r2, -along * r2 * r2
-    own = ci == cj
-    for k in range(2):
+        # of the ray: the ground point moves by λ (da − a·da_z/a_z)
+        n0, n1, n2 = lam * w0, lam * w1, -lam * slope
+        c0 = n0 * Ri[0, 0] + n1 * Ri[1, 0] + n2 * Ri[2, 0]
+        c1 = n0 * Ri[0, 1] + n1 * Ri[1, 1] + n2 * Ri[2, 1]
+        c2 = n0 * Ri[0, 2] + n1 * Ri[1, 2] + n2 * Ri[2, 2]
+        J[k, 0], J[k, 1], J[k, 2] = c2 * y - c1, c0 - c2 * x, c1 * x - c0 * y
+        J[k, 3], J[k, 4], J[k, 5] = p1 * q2 - p2 * q1, p2 * q0 - p0 * q2, p0 * q1 - p1 * q0
+        J[k, 6], J[k, 7], J[k, 8] = w0, w1, slope
+        J[k, 9] = p0 * Rj[2, 0] + p1 * Rj[2, 1] + p2 * Rj[2, 2]
+        # lens i: every parameter scales the ray's (x, y); lens j: the picture
+        along = -(c0 * x + c1 * y) / (s + 2 * (k1 + 2 * k2 * r2) * r2)
         y_k = g * (u if k == 0 else v)
-        base0, base1, base2 = (J[k, cj], J[k, cj + 1], J[k, cj + 2]) if own else (0.0, 0.0, 0.0)
-        J[k, cj], J[k, cj + 1], J[k, cj + 2] = base0 + y_k * sj, base1 + y_k * w2, base2 + y_k * w2 * w2
+        J[k, 10], J[k, 11], J[k, 12] = along * s, along * r2, along * r2 * r2
+        J[k, 13], J[k, 14], J[k, 15] = y_k * sj, y_k * w2, y_k * w2 * w2
     return True
+
+
+def _spread_columns(first: int, second: int, lens_first: int, lens_second: int) -> Array:
+    """(16, 20): columns of `_observe` → unknowns of a pair (frame, frame, lens, lens), each block's offset given."""
+    T = np.zeros((16, 20))
+    for k in range(3):
+        T[k, first + k] = 1.0
+        T[3 + k, second + k] = 1.0
+        T[10 + k, lens_first + k] = 1.0
+        T[13 + k, lens_second + k] += 1.0
+    for k in range(2):
+        T[6 + k, first + 3 + k] = 1.0
+        T[6 + k, second + 3 + k] = -1.0
+    # d/dt_iz = −slope, d/dh_i = slope + up, d/dt_jz = −up
+    T[8, first + 5] = -1.0
+    T[8, first + 6] = 1.0
+    T[9, first + 6] = 1.0
+    T[9, second + 5] = -1.0
+    return T
+
+
+SPREAD = np.stack(
+    [
+        _spread_columns(0, 7, 14, 14),
+        _spread_columns(7, 0, 14, 14),
+        _spread_columns(0, 7, 14, 17),
+        _spread_columns(7, 0, 17, 14),
+    ]
+)
 
 
 def _accumulate(
     pairs: IntArray, starts: IntArray, uv: Array, weight: Array, camera: IntArray,
-    R: Array, t: Array, h: Array, lens: Array, sigma: Array, scale: float,
-    frame: Array, pair: Array, cross: Array, border: Array, frame_rhs: Array, border_rhs: Array, squared: Array,
+    R: Array, t: Array, h: Array, lens: Array, sigma: Array, scale: float, spread: Array,
+    H: Array, g: Array, squared: Array,
 ) -> float:  # fmt: skip
-    """Add all pairs to the normal equations in place; the robust cost. `sigma` (C,) px, `scale` of the Cauchy
-    loss in sigmas; `squared` (M, 2) takes the squared residuals in sigmas."""
-    J, r = np.zeros((2, 20)), np.zeros(2)
-    H, g = np.zeros((20, 20)), np.zeros(20)
+    """Each pair's normal equations H (E, 20, 20) and g (E, 20), in place; the robust cost. `sigma` (C,) px, `scale`
+    of the Cauchy loss in sigmas; `squared` (M, 2) takes the squared residuals in sigmas."""
+    longest = 0
+    for e in range(len(pairs)):
+        longest = max(longest, starts[e + 1] - starts[e])
+    # rows of all points, weighted, the residual in the last column: one product makes H and g
+    rows = np.zeros((2 * longest, 17))
+    J, r = np.zeros((2, 16)), np.zeros(2)
     c2 = scale * scale
     cost = 0.0
     for e in range(len(pairs)):
-        i, j = pairs[e, 0], pairs[e, 1]
-        ci, cj = camera[i], camera[j]
-        n = 17 if ci == cj else 20
-        H[:], g[:] = 0.0, 0.0
-        for m in range(starts[e], starts[e + 1]):
-            for way in range(2):
-                if way == 0:
-                    ok = _observe(uv[m, 0], uv[m, 1], uv[m, 2], uv[m, 3], R[i], t[i], h[i], lens[ci],
-                                  R[j], t[j], lens[cj], 0, 7, 14, n - 3, J, r)  # fmt: skip
-                    sg = sigma[cj]
-                else:
-                    ok = _observe(uv[m, 2], uv[m, 3], uv[m, 0], uv[m, 1], R[j], t[j], h[j], lens[cj],
-                                  R[i], t[i], lens[ci], 7, 0, n - 3, 14, J, r)  # fmt: skip
-                    sg = sigma[ci]
-                s2 = (r[0] * r[0] + r[1] * r[1]) / (sg * sg) if ok else 1e6
+        for way in range(2):
+            i, j = pairs[e, way], pairs[e, 1 - way]
+            li, lj = camera[i], camera[j]
+            Ri, ti, hi, Li, Rj, tj, Lj = R[i], t[i], h[i], lens[li], R[j], t[j], lens[lj]
+            a, b, used = 2 * way, 2 - 2 * way, 0
+            for m in range(starts[e], starts[e + 1]):
+                ok = _observe(
+                    uv[m, a], uv[m, a + 1], uv[m, b], uv[m, b + 1], Ri, ti, hi, Li, Rj, tj, Lj, J, r
+                )
+                s2 = (r[0] * r[0] + r[1] * r[1]) / (sigma[lj] * sigma[lj]) if ok else 1e6
                 squared[m, way] = s2
                 cost += 0.5 * weight[e] * c2 * np.log1p(s2 / c2)
                 if not ok:
                     continue
-                w = weight[e] / ((1 + s2 / c2) * sg * sg)
-                for a in range(n):
-                    x, y = w * J[0, a], w * J[1, a]
-                    g[a] -= x * r[0] + y * r[1]
-                    for b in range(a, n):
-                        H[a, b] += x * J[0, b] + y * J[1, b]
-        for a in range(n):
-            for b in range(a):
-                H[a, b] = H[b, a]
-        bi, bj = 3 * ci, 3 * cj
-        frame[i] += H[:7, :7]
-        frame[j] += H[7:14, 7:14]
-        pair[e] = H[:7, 7:14]
-        frame_rhs[i] += g[:7]
-        frame_rhs[j] += g[7:14]
-        cross[i, :, bi : bi + 3] += H[:7, 14:17]
-        cross[j, :, bi : bi + 3] += H[7:14, 14:17]
-        border[bi : bi + 3, bi : bi + 3] += H[14:17, 14:17]
-        border_rhs[bi : bi + 3] += g[14:17]
-        if n == 20:
-            cross[i, :, bj : bj + 3] += H[:7, 17:20]
-            cross[j, :, bj : bj + 3] += H[7:14, 17:20]
-            border[bi : bi + 3, bj : bj + 3] += H[14:17, 17:20]
-            border[bj : bj + 3, bi : bi + 3] += H[17:20, 14:17]
-            border[bj : bj + 3, bj : bj + 3] += H[17:20, 17:20]
-            border_rhs[bj : bj + 3] += g[17:20]
+                w = np.sqrt(weight[e] / ((1 + s2 / c2) * sigma[lj] * sigma[lj]))
+                for k in range(2):
+                    for col in range(16):
+                        rows[used + k, col] = w * J[k, col]
+                    rows[used + k, 16] = w * r[k]
+                used += 2
+            K = rows[:used].T @ rows[:used]
+            # one lens shared by both frames: its columns add up
+            T = spread[way] if li == lj else spread[2 + way]
+            H[e] += T.T @ np.ascontiguousarray(K[:16, :16]) @ T
+            g[e] -= np.ascontiguousarray(K[16, :16]) @ T
     return cost
 
 
-_compile: Callable[[Any], Any] = numba.njit(cache=True, nogil=True)
+def _scatter(
+    pairs: IntArray, camera: IntArray, H: Array, g: Array,
+    frame: Array, pair: Array, cross: Array, border: Array, frame_rhs: Array, border_rhs: Array,
+) -> None:  # fmt: skip
+    """Sum the pairs' blocks into those of frames and lenses, in place."""
+    at, size, first = np.zeros(4, np.int64), np.array([7, 7, 3, 3]), np.array([0, 7, 14, 17])
+    for e in range(len(pairs)):
+        at[0], at[1] = pairs[e, 0], pairs[e, 1]
+        at[2], at[3] = 3 * camera[at[0]], 3 * camera[at[1]]
+        for p in range(4):
+            for a in range(size[p]):
+                row = first[p] + a
+                if p < 2:
+                    frame_rhs[at[p], a] += g[e, row]
+                    for b in range(7):
+                        frame[at[p], a, b] += H[e, row, first[p] + b]
+                else:
+                    border_rhs[at[p] + a] += g[e, row]
+                for q in range(2, 4):
+                    for b in range(3):
+                        value = H[e, row, first[q] + b]
+                        if p < 2:
+                            cross[at[p], a, at[q] + b] += value
+                        else:
+                            border[at[p] + a, at[q] + b] += value
+        for a in range(7):
+            for b in range(7):
+                pair[e, a, b] = H[e, a, 7 + b]
+
+
+_compile: Callable[[Any], Any] = numba.njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"contract"}
+)
 observe = _observe  # the plain Python function, for tests
 _observe = _compile(_observe)
 _accumulate = _compile(_accumulate)
+_scatter = _compile(_scatter)
 
 
 def linearise(edges: Edges, state: State, sigma_px: Array, robust_scale: float) -> Normal:
     """The normal equations of all image pairs at `state`. `sigma_px`: (C,) of one correspondence, by camera."""
-    n, e, b = len(state.R), len(edges), CAMERA_DOF * len(state.lens) + len(state.lag_s)
-    frame, pair, cross = np.zeros((n, 7, 7)), np.zeros((e, 7, 7)), np.zeros((n, 7, b))
-    border, frame_rhs, border_rhs = np.zeros((b, b)), np.zeros((n, 7)), np.zeros(b)
-    squared = np.zeros((len(edges.uv), 2))
+    n, e, c = len(state.R), len(edges), CAMERA_DOF * len(state.lens)
+    b = c + len(state.lag_s)
+    H, g, squared = np.zeros((e, 20, 20)), np.zeros((e, 20)), np.zeros((len(edges.uv), 2))
     cost = _accumulate(
         edges.pairs, edges.starts, edges.uv, edges.weight, edges.camera, state.R, state.t, state.h, state.lens,
-        sigma_px, robust_scale, frame, pair, cross, border, frame_rhs, border_rhs, squared,
+        sigma_px, robust_scale, SPREAD, H, g, squared,
     )  # fmt: skip
+    frame, pair, cross = np.zeros((n, 7, 7)), np.zeros((e, 7, 7)), np.zeros((n, 7, b))
+    border, frame_rhs, border_rhs = np.zeros((b, b)), np.zeros((n, 7)), np.zeros(b)
+    _scatter(edges.pairs, edges.camera, H, g, frame, pair, cross, border, frame_rhs, border_rhs)
     return Normal(frame, pair, cross, border, frame_rhs, border_rhs, float(cost), squared)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,21 +47,12 @@ def solve(
     """
     params = params or PoseParams()
     s = survey(frames, params, world)
-    index = {f.frame_id: k for k, f in enumerate(s.frames) if not _looks_away(s, k)}
+    down, known = expected_down(s)
+    away = known & (down[:, 2] < params.min_downward)
+    index = {f.frame_id: k for k, f in enumerate(s.frames) if not away[k]}
     edges = edges_of(matches, index, s.cameras, s.camera, params)
     graph = optimise(s, edges, params) if len(edges) else None
     return _solution(s, graph, params)
-
-
-def _looks_away(s: Survey, k: int) -> bool:
-    """Whether the gimbal says that the picture is no map photo, and the gimbal is believed."""
-    down, known = expected_down(s)
-    return bool(known[k]) and bool(down[k, 2] < 0.4)
-
-
-def sigma_px(s: Survey, state: State, params: PoseParams) -> Array:
-    """Standard deviation of one correspondence (C,), pixels, by camera."""
-    return np.asarray(params.sigma_of_f * state.lens[:, 0])
 
 
 def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
@@ -76,11 +68,12 @@ def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
     priors = priors_of(tied, start, submap, params)
     sigma = params.sigma_of_f * start.state.lens[:, 0]
     held = replace(priors, lens_sigma=np.full_like(priors.lens_sigma, 1e-6), lag_sigma_s=1e-6)
-    coarse = adjust(edges, held, start.state, sigma, 5 * params.robust_scale, params.coarse_steps)
-    good = _right_edges(edges, coarse.squared, params.wrong_edge)
+    thin = edges.thinned(params.coarse_points)
+    coarse = adjust(thin, held, start.state, sigma, 5 * params.robust_scale, params.coarse_steps, 5e-3)
+    good = _right_edges(thin, coarse.squared, params.wrong_edge)
     edges = edges.subset(good)
     priors = _learnt(tied, priors, coarse.state, params)
-    fine = adjust(edges, priors, coarse.state, sigma, params.robust_scale, params.fine_steps)
+    fine = adjust(edges, priors, coarse.state, sigma, params.robust_scale, params.fine_steps, 3e-4)
     left = {tuple(p) for p in edges.pairs.tolist()}
     ids = [f.frame_id for f in tied.frames]
     dropped = tuple((ids[i], ids[j]) for i, j in every.pairs.tolist() if (i, j) not in left)
@@ -117,11 +110,12 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
         drone=s.drone,
         anchor=start.state.t,
         down=down,
-        tilt_sigma=np.where(known, params.gimbal_sigma_rad, 2 * params.tilt_sigma_rad),
+        tilt_sigma=np.where(known, params.gimbal_start_rad, params.tilt_start_rad),
         yaw=np.where(loose, yaw, np.nan),
         yaw_sigma=np.full(len(s), params.yaw_sigma_rad),
         height=start.height,
-        height_sigma=np.where(loose, 0.1, 1.0) * np.ones(len(s)),
+        # of a whole submap, not of each frame: its frames share one start value
+        height_sigma=np.where(loose, 0.1, 1.0) * np.sqrt(np.bincount(submap)[submap]),
         ground_step_sigma_m=params.ground_step_sigma_m,
         lens=start.state.lens,
         lens_sigma=lens_sigma,
@@ -131,25 +125,34 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
 
 def _learnt(s: Survey, priors: Priors, state: State, params: PoseParams) -> Priors:
     """Priors after the coarse adjustment: how good each drone's GPS is, and how its camera is mounted."""
-    gps_sigma, down, tilt = priors.gps_sigma.copy(), priors.down.copy(), priors.tilt_sigma.copy()
-    seen = gravity(state.R)
+    gps_sigma, altitude_sigma = priors.gps_sigma.copy(), priors.altitude_sigma.copy()
+    down, tilt = priors.down.copy(), priors.tilt_sigma.copy()
     _, known = expected_down(s)
-    miss = np.hypot(*(state.t[:, :2] - s.gps[:, :2]).T)
+    # what a gimbal or an airframe adds to the expected direction, in the camera's own frame
+    lean = (gravity(state.R) - priors.down)[:, :2]
+    miss = state.t - s.gps
     for d in range(len(s.drones)):
         mine = (s.drone == d) & s.has_gps
-        if mine.sum() >= 10:
-            observed = float(np.median(miss[mine])) / 1.177
-            default = s.gps_sigma[mine] >= params.gps_sigma_m
-            gps_sigma[mine] = np.where(default, max(observed, 1.0), np.maximum(s.gps_sigma[mine], observed))
-        for c in np.unique(s.camera):
-            group = (s.drone == d) & (s.camera == c) & ~known
-            if group.sum() >= 5:
-                middle = np.median(seen[group], axis=0)
-                middle /= np.linalg.norm(middle)
-                off = np.linalg.norm(seen[group] - middle, axis=1)
-                down[group] = middle
-                tilt[group] = max(0.03, float(np.median(off)) / 1.177)
-    return replace(priors, gps_sigma=gps_sigma, down=down, tilt_sigma=tilt)
+        if mine.sum() >= params.min_frames_to_learn:
+            observed = max(float(np.median(np.hypot(*miss[mine, :2].T))) / 1.177, params.gps_learnt_floor_m)
+            stated = s.gps_sigma[mine] < params.gps_sigma_m
+            gps_sigma[mine] = np.where(stated, np.maximum(s.gps_sigma[mine], observed), observed)
+        high = mine & np.isfinite(miss[:, 2])
+        if high.sum() >= params.min_frames_to_learn:
+            observed = 1.48 * float(np.median(np.abs(miss[high, 2] - np.median(miss[high, 2]))))
+            observed = min(max(observed, params.altitude_learnt_floor_m), params.altitude_sigma_m)
+            altitude_sigma[high] = np.maximum(np.minimum(s.altitude_sigma[high], observed), observed)
+        for c, gimbal in product(np.unique(s.camera), (True, False)):
+            group = (s.drone == d) & (s.camera == c) & (known == gimbal)
+            if group.sum() < params.min_frames_to_learn:
+                continue
+            middle = np.median(lean[group], axis=0)
+            off = float(np.median(np.linalg.norm(lean[group] - middle, axis=1))) / 1.177
+            down[group, :2] += middle
+            # half, since the scatter is mostly that of an adjustment that was still free to tilt
+            tilt[group] = max(params.gimbal_sigma_rad, off / 2) if gimbal else max(params.tilt_floor_rad, off)
+    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    return replace(priors, gps_sigma=gps_sigma, altitude_sigma=altitude_sigma, down=down, tilt_sigma=tilt)
 
 
 def _solution(s: Survey, graph: Graph | None, params: PoseParams) -> Solution:

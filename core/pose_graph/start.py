@@ -18,6 +18,7 @@ from core.pose_graph.survey import Survey
 
 # GPS holds a submap's scale and heading when it knows them better than this (share, radians).
 GPS_HOLDS = 0.15
+HORIZONTAL_RAD = -0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,19 +34,26 @@ class Start:
     yaw_offset: Array
 
 
+def believed_gimbal(s: Survey) -> NDArray[np.bool_]:
+    """(N,) whether a frame says how its camera was pitched, and is believed."""
+    pitch = s.attitude[:, 1]
+    known = np.isfinite(pitch)
+    # Makes that call the view straight down "0" would have every photo show the horizon: believe none then.
+    if known.any() and np.median(pitch[known]) > HORIZONTAL_RAD:
+        known = np.zeros_like(known)
+    return known
+
+
 def expected_down(s: Survey) -> tuple[Array, NDArray[np.bool_]]:
     """Each camera's direction to the earth (N, 3) by its gimbal, straight ahead where that is not known (N,)."""
+    known = believed_gimbal(s)
     pitch, roll = s.attitude[:, 1], s.attitude[:, 2]
-    known = np.isfinite(pitch)
-    # A make that calls the straight-down view "0" would have every photo show the horizon: then nobody is believed.
-    if known.any() and np.median(pitch[known]) > -0.6:
-        known = np.zeros_like(known)
     pitch, roll = np.where(known, pitch, -np.pi / 2), np.where(known & np.isfinite(roll), roll, 0.0)
     return gravity(rotation_of(np.zeros(len(s)), pitch, roll)), known
 
 
 def starting(s: Survey, edges: Edges, submap: IntArray, params: PoseParams) -> Start:
-    """One linear solve for all submaps; those that GPS cannot hold get scale and heading from what is left."""
+    """One linear solve for all submaps; where GPS cannot hold one, metadata give its scale and heading."""
     level = levelling(expected_down(s)[0])
     count = int(submap.max()) + 1
     held = np.array([_gps_holds(s, submap == k) for k in range(count)])
@@ -83,7 +91,7 @@ def _gps_holds(s: Survey, mine: NDArray[np.bool_]) -> bool:
     if len(xy) < 2:
         return False
     radius = float(np.sqrt(((xy - np.median(xy, axis=0)) ** 2).sum(1).mean()))
-    return float(np.median(sigma)) < GPS_HOLDS * radius * np.sqrt(len(xy))
+    return bool(np.median(sigma) < GPS_HOLDS * radius * np.sqrt(len(xy)))
 
 
 def _typical(values: Array, default: float) -> float:
@@ -123,7 +131,7 @@ def _georeferenced(
 
 
 def yaw_offsets(s: Survey, yaw: Array, trusted: NDArray[np.bool_]) -> Array:
-    """By drone, what to add to the metadata's yaw to get the picture's (D,), NaN where frames do not agree."""
+    """(D,) by drone: what to add to the metadata's yaw to get the picture's, NaN where frames disagree."""
     offset = np.full(len(s.drones), np.nan)
     usable = trusted & np.isfinite(s.attitude[:, 0])
     for d in range(len(s.drones)):

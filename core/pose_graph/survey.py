@@ -73,6 +73,12 @@ def usable_fix(fix: GpsFix | None) -> GpsFix | None:
     return fix
 
 
+def capture_order(frame: GraphFrame) -> tuple[float, str, str]:
+    """Sorts frames by the time of capture; what has none comes last."""
+    time = frame.meta.captured_s
+    return (np.inf if time is None or not np.isfinite(time) else time, frame.name, frame.frame_id)
+
+
 def survey(frames: Sequence[GraphFrame], params: PoseParams, world: World | None = None) -> Survey:
     """The frames as arrays; `world` keeps an earlier origin, None chooses one from the set of frames."""
     ordered = tuple(sorted({f.frame_id: f for f in frames}.values(), key=lambda f: f.frame_id))
