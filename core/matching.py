@@ -54,8 +54,8 @@ class MatchParams:
     slope_breadth_px: float = 30.0
     min_similarity: float = 0.75
     min_voted: int = 10
-    min_inliers: int = 12
-    min_final: int = 16
+    min_inliers: int = 10
+    min_final: int = 15
     min_vote_share: float = 0.5
     min_keypoint_share: float = 0.05
     max_final: int = 120
