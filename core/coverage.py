@@ -20,7 +20,7 @@ from core.grid import (
     zoom_resolution_m,
 )
 from core.outline import ground_outline
-from core.pyramid import Rgba, decode, encode, reduce
+from core.pyramid import Rgba, decode, encode, halve
 
 FUSION = FusionParams()
 SPARE_ZOOMS = 2
@@ -114,9 +114,24 @@ def top_zoom(tiles: Collection[TileKey]) -> int:
     return max(0, zoom - spread.bit_length() - SPARE_ZOOMS)
 
 
-def overview(pictures: Sequence[Rgba | None]) -> Encoded | None:
-    """An overview's encoded picture from its children's pictures (NW, NE, SW, SE; None = nothing known)."""
-    return encode(reduce(pictures)) if any(p is not None for p in pictures) else None
+def quarter(data: bytes) -> Rgba:
+    """A tile's share of its parent: its encoded picture at half the size, (256, 256, 4) uint8."""
+    return halve(decode(data))
+
+
+def overview(quarters: Sequence[Rgba | None]) -> Encoded | None:
+    """An overview's encoded picture from its children's quarters (NW, NE, SW, SE; None = nothing known).
+
+    The same as `core.pyramid.reduce` of the children, but children that did not change need no work.
+    """
+    if all(q is None for q in quarters):
+        return None
+    canvas = np.zeros((TILE_PX, TILE_PX, 4), np.uint8)
+    for k, picture in enumerate(quarters):
+        if picture is not None:
+            row, col = divmod(k, 2)
+            canvas[row * TILE_PX // 2 :, col * TILE_PX // 2 :][: TILE_PX // 2, : TILE_PX // 2] = picture
+    return encode(canvas)
 
 
 def pyramid(natives: Mapping[TileKey, bytes]) -> dict[TileKey, bytes]:
@@ -126,8 +141,7 @@ def pyramid(natives: Mapping[TileKey, bytes]) -> dict[TileKey, bytes]:
         return {}
     above: dict[TileKey, bytes] = {}
     for tile in ancestors(tiles, top_zoom(tiles)):
-        below = [decode(tiles[c]) if c in tiles else None for c in children(tile)]
-        encoded = overview(below)
+        encoded = overview([quarter(tiles[c]) if c in tiles else None for c in children(tile)])
         if encoded is not None:
             tiles[tile] = above[tile] = encoded[0]
     return above

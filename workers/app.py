@@ -39,6 +39,8 @@ store = get_store(settings)
 log = structlog.get_logger("workers")
 
 MAX_ATTEMPTS = 4
+CLAIM_TTL_S = 60.0
+"""A tile that was handed out is handed out again after this time."""
 
 
 def stage(name: str) -> Callable[[Callable[P, None]], Callable[P, None]]:

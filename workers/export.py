@@ -19,7 +19,7 @@ from services.catalog.poses import Poses
 from services.report import report
 from services.tables import Export, Mission
 from workers.app import Stopwatch, db, log, settings, stage, store
-from workers.photos import MissionPhotos, PhotoShelf
+from workers.photos import MissionPhotos, shelf
 
 MEDIA_TYPES = {
     ".tif": "image/tiff",
@@ -29,7 +29,6 @@ MEDIA_TYPES = {
 }
 
 Maker = Callable[[Path, Mission], None]
-shelf = PhotoShelf.of(store, settings.photo_cache_bytes)
 
 
 @stage("export")

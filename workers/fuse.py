@@ -10,11 +10,9 @@ from services.catalog import missions, poses, tiles
 from services.catalog.poses import Poses
 from services.catalog.tiles import TileBox
 from services.queue import send
-from workers.app import Stopwatch, db, settings, stage, store
-from workers.photos import MissionPhotos, PhotoShelf
+from workers.app import Stopwatch, db, stage, store
+from workers.photos import MissionPhotos, shelf
 from workers.pictures import put_tile
-
-shelf = PhotoShelf.of(store, settings.photo_cache_bytes)
 
 
 @stage("fuse")

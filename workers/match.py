@@ -11,10 +11,8 @@ from services.catalog import frames, missions, pairs
 from services.catalog.frames import Seen
 from services.catalog.pairs import Key, PairResult
 from services.queue import send
-from workers.app import Stopwatch, db, settings, stage, store
-from workers.photos import PhotoShelf
-
-shelf = PhotoShelf.of(store, settings.photo_cache_bytes)
+from workers.app import Stopwatch, db, stage
+from workers.photos import shelf
 
 
 @stage("match")

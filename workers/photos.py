@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from core.decode import decode_rgb
 from core.features import Features
 from services.storage import ObjectStore
+from workers.app import settings, store
 
 Pixels = NDArray[np.uint8]
 
@@ -108,6 +109,10 @@ class PhotoShelf:
 
         pixels: Pixels = self.pictures.get((key, max_side), load)
         return pixels
+
+
+shelf = PhotoShelf.of(store, settings.photo_cache_bytes)
+"""The one shelf of this process."""
 
 
 @dataclass(frozen=True, slots=True)

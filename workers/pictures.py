@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 
-from core.coverage import Encoded
+from core.coverage import Encoded, quarter
 from core.grid import TileKey
-from core.pyramid import Rgba, decode
+from core.pyramid import Rgba
 from services.catalog.tiles import Render
 from services.storage import ObjectStore
 from workers.photos import BytesLru
@@ -26,8 +26,8 @@ def put_tile(
     return Render(tile, generation, key, etag, media_type, len(data))
 
 
-class Pictures:
-    """Decoded tiles, the last ones used."""
+class Quarters:
+    """What tiles contribute to their parents, of the tiles used last."""
 
     def __init__(self, store: ObjectStore, limit_bytes: int) -> None:
         """Holds about `limit_bytes`."""
@@ -35,12 +35,12 @@ class Pictures:
         self._decoded = BytesLru(limit_bytes)
 
     def get(self, object_key: str | None) -> Rgba | None:
-        """The picture under this key, None for a tile that is empty."""
+        """The quarter of the tile under this key, None for a tile that is empty."""
         if object_key is None:
             return None
 
         def load() -> tuple[Rgba, int]:
-            rgba = decode(self._store.get(object_key))
+            rgba = quarter(self._store.get(object_key))
             return rgba, rgba.nbytes
 
         picture: Rgba = self._decoded.get(object_key, load)

@@ -6,14 +6,16 @@ from collections.abc import Collection, Mapping, Sequence
 
 from core.coverage import overview, top_zoom
 from core.grid import TileKey, children, parent
-from services.catalog import missions, tiles
+from services.catalog import backlog, missions, tiles
 from services.catalog.tiles import Key, Render, TileBox
 from services.errors import RevisionConflict
 from services.queue import send
-from workers.app import Stopwatch, db, log, settings, stage, store
-from workers.pictures import Pictures, put_tile
+from workers.app import CLAIM_TTL_S, Stopwatch, db, log, settings, stage, store
+from workers.pictures import Quarters, put_tile
 
-pictures = Pictures(store, settings.photo_cache_bytes // 4)
+quarters = Quarters(store, settings.photo_cache_bytes // 8)
+ENOUGH = 64
+"""Tiles that are worth a revision of their own while a final map is drawn."""
 
 
 @stage("publish")
@@ -25,7 +27,11 @@ def publish(mission_id: str) -> None:
             mission = missions.get(tx, mission_id)
             pending = tiles.pending_renders(tx, mission_id)
             bounds = tiles.bounds(tx, mission_id)
+            desk = backlog.of(tx, mission_id, CLAIM_TTL_S)
         if not pending or mission.zoom is None:
+            break
+        more = desk.to_render + desk.in_flight > 0
+        if mission.state == "finalising" and more and len(pending) < ENOUGH:
             break
         changes = _with_overviews(mission_id, mission.zoom, pending, bounds)
         try:
@@ -81,7 +87,7 @@ def _overviews(
             mission_id,
             generation,
             tile,
-            overview([pictures.get(picture_key(c)) for c in children(tile)]),
+            overview([quarters.get(picture_key(c)) for c in children(tile)]),
         )
         for tile in stale
     }

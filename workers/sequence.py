@@ -9,27 +9,25 @@ from dataclasses import replace
 from core.matching import PairMatch
 from core.mosaic import lay_out
 from core.neighbours import Sighting, candidates
-from core.pose_graph import GraphFrame, Solution, solve
+from core.pose_graph import GraphFrame, Solution, place, solve
 from services.catalog import backlog, frames, missions, pairs, poses, tiles
 from services.catalog.backlog import Backlog
 from services.catalog.pairs import Key as PairKey
 from services.catalog.tiles import Key as TileId
 from services.queue import send
 from services.tables import Mission
-from workers.app import Stopwatch, app, db, log, settings, stage, store
+from workers.app import CLAIM_TTL_S, Stopwatch, app, db, log, settings, stage
 from workers.lease import held
-from workers.photos import PhotoShelf, Pixels
+from workers.photos import Pixels, shelf
 from workers.posing import Known, changed, everything, joined, update_of
 
-GROWTH = 1.0
+GROWTH = 1.5
 """All poses are solved again when the mission has grown so many times since the last time."""
 FEW = 8
-CLAIM_TTL_S = 60.0
 ASK_AGAIN_S = 60.0
 LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 8, 16, 24
 _REMEMBERED = 8
 
-shelf = PhotoShelf.of(store, settings.photo_cache_bytes // 4)
 _known: dict[str, Known] = {}
 _asked: dict[tuple[str, PairKey], float] = {}
 _come_back: dict[str, float] = {}
@@ -126,7 +124,7 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
         assert before is not None
         matches = _matches(mission.id, new_ids)
         graph = [known.seen[k] for k in sorted(posed | new_ids)]
-        solved = solve(graph, matches)  # TEMP
+        solved = place(solution, graph, new_ids, matches)
         after = joined(before, solved, new_ids, known.camera_keys)
         dirty = changed(before, after)
         update = update_of(after, known.camera_keys, new_ids)
