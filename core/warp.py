@@ -274,8 +274,11 @@ def _look(
         if (x - center[0]) ** 2 + (y - center[1]) ** 2 > reach_m * reach_m:
             continue
         u, v, cos_view = _project(x, y, h_m, world_R_cam, center, lens)
-        beyond = max(max(-u, u - (width - 1)), max(-v, v - (height - 1)))
-        if cos_view < min_cos_view or beyond >= skirt_px:
+        if cos_view < min_cos_view:
+            continue
+        # The flatter a ray, the more ground a pixel covers: this way no skirt is wider on the ground.
+        beyond = max(max(-u, u - (width - 1)), max(-v, v - (height - 1))) / (cos_view * cos_view)
+        if beyond >= skirt_px:
             continue
         if beyond > 0:
             weight[k] = int((INSIDE - 1) * (1 - beyond / skirt_px))
