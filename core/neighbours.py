@@ -162,10 +162,17 @@ def _in_appearance(
         # Rounded, so that the last bits of a product do not decide between twins: the earlier one wins.
         similarity = np.round(words[block] @ words.T / _SIMILARITY_STEP)
         similarity[np.arange(len(block)), block] = -np.inf
-        best = np.argsort(-similarity, axis=1, kind="stable")
-        for i, row in zip(block, best, strict=True):
+        for i, row in zip(block, similarity, strict=True):
             count = params.alike if ordered[i].gps is not None else params.alike_without_gps
-            yield i, [int(j) for j in row[: min(count, len(ordered) - 1)]]
+            yield i, _highest(row, min(count, len(ordered) - 1))
+
+
+def _highest(row: NDArray[np.float32], count: int) -> list[int]:
+    """The places of the `count` highest values (N,), the earlier place first among equals."""
+    if count == 0:
+        return []
+    enough = np.flatnonzero(row >= np.partition(row, -count)[-count])
+    return [int(j) for j in enough[np.argsort(-row[enough], kind="stable")][:count]]
 
 
 def _peculiar(words: NDArray[np.float32]) -> NDArray[np.float32]:
