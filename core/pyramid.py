@@ -26,12 +26,13 @@ QUALITY = 80
 
 def reduce(children: Sequence[Rgba | None]) -> Rgba:
     """Four tiles NW, NE, SW, SE (None = transparent) → their parent, the alpha-weighted 2 × 2 mean."""
-    canvas = np.zeros((2 * TILE_PX, 2 * TILE_PX, 4), np.uint8)
+    half = TILE_PX // 2
+    out = np.zeros((TILE_PX, TILE_PX, 4), np.uint8)
     for k, child in enumerate(children):
         if child is not None:
             row, col = divmod(k, 2)
-            canvas[row * TILE_PX :, col * TILE_PX :][:TILE_PX, :TILE_PX] = child
-    return halve(canvas)
+            out[row * half :, col * half :][:half, :half] = halve(child)
+    return out
 
 
 def halve(rgba: Rgba) -> Rgba:
