@@ -35,8 +35,8 @@ def edges_of(
     pairs = np.array([(index[m.low], index[m.high]) for m in ordered], np.int64).reshape(-1, 2)
     count = np.array([len(m.uv_low) for m in ordered], np.int64)
     edge = np.repeat(np.arange(len(ordered)), count)
-    axis = np.array([(c.cx, c.cy) for c in cameras])[camera]
-    size = np.array([(c.width, c.height) for c in cameras], float)[camera]
+    axis = np.array([(c.cx, c.cy) for c in cameras]).reshape(-1, 2)[camera]
+    size = np.array([(c.width, c.height) for c in cameras], float).reshape(-1, 2)[camera]
     low = np.concatenate([m.uv_low for m in ordered]) if ordered else np.zeros((0, 2))
     high = np.concatenate([m.uv_high for m in ordered]) if ordered else np.zeros((0, 2))
     keep = spread(low / size[pairs[edge, 0]], edge, params.points_per_edge)

@@ -96,6 +96,9 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
     loose = ~start.held_by_gps[submap]
     yaw = s.attitude[:, 0] + np.nan_to_num(start.yaw_offset[s.drone])
     yaw = np.where(np.isfinite(yaw), yaw, heading(start.state.R))
+    # where GPS cannot tell scale or heading its fixes only say where the middle is, and that the start has used
+    gps = s.gps.copy()
+    gps[loose & s.has_gps, :2] = start.state.t[loose & s.has_gps, :2]
     c = len(s.cameras)
     focal = np.where(s.focal_known, params.focal_log_sigma, 3 * params.focal_log_sigma)
     k1 = np.full(c, params.k1_sigma)
@@ -103,10 +106,10 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
     free = params.self_calibrate & (np.bincount(s.camera, minlength=c) >= params.min_frames_to_calibrate)
     lens_sigma = np.where(free[:, None], np.column_stack((focal, k1, k2)), 1e-6)
     return Priors(
-        gps=s.gps,
+        gps=gps,
         gps_sigma=s.gps_sigma,
         altitude_sigma=s.altitude_sigma,
-        velocity=s.velocity,
+        velocity=np.where(loose[:, None], 0.0, s.velocity),
         drone=s.drone,
         anchor=start.state.t,
         down=down,
@@ -130,7 +133,7 @@ def _learnt(s: Survey, priors: Priors, state: State, params: PoseParams) -> Prio
     _, known = expected_down(s)
     # what a gimbal or an airframe adds to the expected direction, in the camera's own frame
     lean = (gravity(state.R) - priors.down)[:, :2]
-    miss = state.t - s.gps
+    miss = state.t - priors.gps
     for d in range(len(s.drones)):
         mine = (s.drone == d) & s.has_gps
         if mine.sum() >= params.min_frames_to_learn:
