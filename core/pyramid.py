@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from core.grid import TILE_PX
+from core.warp import compiled
 
 Rgba = NDArray[np.uint8]
 
@@ -41,15 +42,23 @@ def halve(rgba: Rgba) -> Rgba:
     if (rgba[..., 3] == 255).all():
         # INTER_AREA by exactly 2 is integer: (a + b + c + d + 2) >> 2.
         return np.asarray(cv2.resize(rgba, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    # Sums of four products stay below 2^24, so float32 is exact until the one division.
-    alpha = rgba[..., 3].astype(np.float32)
-    premultiplied = rgba.astype(np.float32)
-    premultiplied[..., :3] *= alpha[..., None]
-    mean = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)
-    colour = mean[..., :3] / np.maximum(mean[..., 3:], np.float32(0.25))
-    return np.concatenate((colour + np.float32(0.5), mean[..., 3:] + np.float32(0.5)), axis=2).astype(
-        np.uint8
-    )
+    out = np.empty((height, width, 4), np.uint8)
+    _halve(np.ascontiguousarray(rgba), out)
+    return out
+
+
+@compiled
+def _halve(rgba: Rgba, out: Rgba) -> None:
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            a, b = int(rgba[2 * y, 2 * x, 3]), int(rgba[2 * y, 2 * x + 1, 3])
+            c, d = int(rgba[2 * y + 1, 2 * x, 3]), int(rgba[2 * y + 1, 2 * x + 1, 3])
+            total = a + b + c + d
+            out[y, x, 3] = (total + 2) >> 2
+            for k in range(3):
+                upper = a * rgba[2 * y, 2 * x, k] + b * rgba[2 * y, 2 * x + 1, k]
+                lower = c * rgba[2 * y + 1, 2 * x, k] + d * rgba[2 * y + 1, 2 * x + 1, k]
+                out[y, x, k] = (2 * (upper + lower) + total) // (2 * total) if total else 0
 
 
 def encode(rgba: Rgba, quality: int = QUALITY) -> tuple[bytes, str] | None:
