@@ -10,9 +10,12 @@ from services.catalog import missions, poses, tiles
 from services.catalog.poses import Poses
 from services.catalog.tiles import TileBox
 from services.queue import send
-from workers.app import Stopwatch, db, stage, store
+from workers import warmup
+from workers.app import Stopwatch, before_the_fork, db, stage, store
 from workers.photos import MissionPhotos, shelf
 from workers.pictures import put_tile
+
+before_the_fork(warmup.rendering)
 
 
 @stage("fuse")

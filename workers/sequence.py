@@ -16,7 +16,8 @@ from services.catalog.pairs import Key as PairKey
 from services.catalog.tiles import Key as TileId
 from services.queue import send
 from services.tables import Mission
-from workers.app import CLAIM_TTL_S, Stopwatch, app, db, log, settings, stage
+from workers import warmup
+from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
 from workers.lease import held
 from workers.photos import Pixels, shelf
 from workers.posing import Known, changed, everything, joined, update_of
@@ -31,6 +32,9 @@ _REMEMBERED = 8
 _known: dict[str, Known] = {}
 _asked: dict[tuple[str, PairKey], float] = {}
 _come_back: dict[str, float] = {}
+
+
+before_the_fork(warmup.solving)
 
 
 @stage("sequence")

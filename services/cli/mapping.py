@@ -12,6 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from core.errors import NothingToMap, OrthostreamError
 from services.cli.client import Client, Uploaded
 from services.cli.flight import Photo, identify
 
@@ -19,6 +20,13 @@ EXPORTS = ("poses.json", "report.json", "footprints.geojson", "route.csv", "mosa
 PARALLEL = 4
 POLL_S = 0.25
 STUCK_S = 900.0
+SHOWN = 20
+
+
+class StandsStill(OrthostreamError):
+    """The mission has made no progress for a quarter of an hour. The server's log says why."""
+
+    code = "stands_still"
 
 
 @dataclass
@@ -107,7 +115,7 @@ def upload_all(
 def follow(
     client: Client, mission_id: str, tally: Tally, screen: Screen, until: Callable[[str], bool]
 ) -> None:
-    """Shows the mission's progress until its state satisfies `until`. Raises TimeoutError."""
+    """Shows the mission's progress until its state satisfies `until`. Raises StandsStill."""
     last, moved_at = None, time.monotonic()
     while True:
         now = client.progress(mission_id)
@@ -122,8 +130,17 @@ def follow(
         if mark != last:
             last, moved_at = mark, time.monotonic()
         if time.monotonic() - moved_at > STUCK_S:
-            raise TimeoutError("the mission stands still")
+            raise StandsStill()
         time.sleep(POLL_S)
+
+
+def deliver(client: Client, mission_id: str, out: Path, console: Console) -> None:
+    """Downloads the exports of a finished mission. Raises NothingToMap, with what was wrong."""
+    if "mosaic.tif" in fetch(client, mission_id, out, console):
+        return
+    lines = [f"  {f['name']}: {f['reason']}" for f in client.frames(mission_id, "rejected")]
+    more = [f"  … and {len(lines) - SHOWN} more"] if len(lines) > SHOWN else []
+    raise NothingToMap("\n".join(["There is no map to make of these photos:", *lines[:SHOWN], *more]))
 
 
 def fetch(client: Client, mission_id: str, out: Path, console: Console) -> list[str]:

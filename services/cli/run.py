@@ -15,11 +15,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from core.errors import NothingToMap, OrthostreamError
 from services.cli.checkpoints import add_checkpoints, read_gcp
 from services.cli.client import Client
 from services.cli.flight import Photo, find_photos
-from services.cli.mapping import Screen, Tally, fetch, follow, upload_all
+from services.cli.mapping import Screen, Tally, deliver, follow, upload_all
 from services.cli.serve import embedded_stack
 
 HOME = ".orthostream"
@@ -128,15 +127,7 @@ def map_photos(
             raise failed[0]
         client.finalise(mission_id)
         follow(client, mission_id, tally, screen, lambda state: state == "final")
-    fetched = fetch(client, mission_id, out, console)
-    if "mosaic.tif" not in fetched:
-        raise NothingToMap(_why_not(client, mission_id, tally))
-
-
-def _why_not(client: Client, mission_id: str, tally: Tally) -> str:
-    reasons = {f["name"]: f["reason"] for f in client.frames(mission_id, "rejected")} | tally.refused
-    lines = [f"  {name}: {reason}" for name, reason in sorted(reasons.items())[:20]]
-    return "\n".join(["There is no map to make of these photos:", *lines])
+    deliver(client, mission_id, out, console)
 
 
 def summary(out: Path, console: Console, url: str | None) -> None:
@@ -169,6 +160,3 @@ def summary(out: Path, console: Console, url: str | None) -> None:
 
 def _number(value: float | None, form: str) -> str:
     return "–" if value is None else form.format(value)
-
-
-__all__ = ["OrthostreamError", "map_photos", "run", "stop_on_signals", "summary"]

@@ -1,0 +1,84 @@
+"""Compiles and loads, before the pool forks, what every process needs: shared memory, no slow first photo."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from core.coverage import draw_block, mission_zoom, tiles_under
+from core.exposure import balanced
+from core.features import FeatureParams, extract
+from core.frame import Attitude, FrameMeta, GpsFix
+from core.fusion import FrameIndex
+from core.geometry import Array, Camera, Pose, PosedFrame, World
+from core.matching import MatchCounts, PairMatch
+from core.pyramid import Rgba
+
+HEIGHT_M, STEP_M, SIDE_PX = 60.0, 12.0, 256
+NORTH_UP_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+WORLD = World(47.0, 8.0, 400.0)
+
+
+class _Chequered:
+    """Photos of nothing in particular."""
+
+    def photo(self, frame_id: str) -> Rgba:
+        rows, cols = np.indices((SIDE_PX * 3 // 4, SIDE_PX))
+        grey = ((rows // 8 + cols // 8) % 2 * 120 + rows % 97).astype(np.uint8)
+        return np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2))
+
+    def thumb(self, frame_id: str) -> Rgba:
+        return np.ascontiguousarray(self.photo(frame_id)[::2, ::2])
+
+
+def _camera() -> Camera:
+    return _meta(0).camera()
+
+
+def _center(k: int) -> Array:
+    return np.array([STEP_M * (k % 3), STEP_M * (k // 3), HEIGHT_M])
+
+
+def _meta(k: int) -> FrameMeta:
+    lon, lat, alt = WORLD.to_geodetic(_center(k)[None])[0]
+    fix = GpsFix(float(lat), float(lon), float(alt))
+    height = SIDE_PX * 3 // 4
+    return FrameMeta(SIDE_PX, height, 200.0, 1.7e9 + k, fix, HEIGHT_M, Attitude(0.0), "drone", "body")
+
+
+def rendering() -> None:
+    """Features, rendering, encoding."""
+    photos = _Chequered()
+    extract(photos.photo("0"), (SIDE_PX, SIDE_PX), FeatureParams())
+    frames = [
+        PosedFrame(str(k), _camera(), Pose(NORTH_UP_DOWN, _center(k), 0.0), (1.0, 1.01, 1.02))
+        for k in range(2)
+    ]
+    frames = balanced(frames, WORLD, {f.frame_id: photos.thumb(f.frame_id) for f in frames})
+    zoom = mission_zoom(frames, WORLD, None)
+    assert zoom is not None
+    tiles = sorted(tiles_under(frames[0], WORLD, zoom))
+    draw_block(tiles[:2], WORLD, FrameIndex(frames), photos)
+
+
+def solving() -> None:
+    """The pose graph, and placing a frame in it."""
+    from core.pose_graph import GraphFrame, place, solve
+
+    frames = [GraphFrame(f"{k:032x}", f"{k}.jpg", _meta(k)) for k in range(6)]
+    matches = [_match(i, j) for i in range(6) for j in range(i + 1, 6) if abs(i - j) in (1, 3)]
+    solution = solve(frames[:5], [m for m in matches if m.high != frames[5].frame_id])
+    place(solution, frames, [frames[5].frame_id], matches)
+
+
+def _match(i: int, j: int) -> PairMatch:
+    """What two frames would see of the same flat ground."""
+    camera = _camera()
+    a, b = (Pose(NORTH_UP_DOWN, _center(k), 0.0) for k in (i, j))
+    xs, ys = np.meshgrid(np.linspace(20, SIDE_PX - 20, 9), np.linspace(20, SIDE_PX * 0.7, 9))
+    uv = np.column_stack((xs.ravel(), ys.ravel()))
+    other = b.pixels(camera, a.ground(camera, uv))
+    seen = ((other > 0) & (other < (camera.width, camera.height))).all(1)
+    uv_low, uv_high = uv[seen].astype(np.float32), other[seen].astype(np.float32)
+    return PairMatch(
+        f"{i:032x}", f"{j:032x}", True, "ok", uv_low, uv_high, MatchCounts(final=int(seen.sum()))
+    )
