@@ -216,9 +216,12 @@ def _at_scale(photo: Rgb, frame: PosedFrame, resolution_m: float) -> Rgb:
 def _layer(
     label: int, frame: PosedFrame, photo: Rgb, labels: Labels, places: Int32, params: FusionParams
 ) -> Layer:
-    """Warp a winner where it wins, and two cells around, as far as the blending of its pixels looks."""
+    """Warp a winner where it wins, and one cell around, as far as the blending of its pixels looks.
+
+    Its pixels lie within half a cell of its knots' cells, and at each level look one pixel farther at most.
+    """
     own = (labels == label).astype(np.uint8)
-    needed = cv2.dilate(own, np.ones((5, 5), np.uint8)).astype(bool)
+    needed = cv2.dilate(own, np.ones((3, 3), np.uint8)).astype(bool)
     rows, cols = np.flatnonzero(needed.any(1)), np.flatnonzero(needed.any(0))
     top, bottom, left, right = rows[0], rows[-1] + 1, cols[0], cols[-1] + 1
     # One knot more all round; at the lattice's own edge the last knot is repeated, pixels there are not used.

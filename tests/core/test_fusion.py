@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from core.fusion import FrameIndex, FusionParams, overlapping, render
 from core.geometry import Array, Camera, Pose, PosedFrame, World
 from core.grid import MercatorGrid, UtmGrid, utm_epsg
+from core.warp import warp
 
 Rgb = NDArray[np.uint8]
 
@@ -169,6 +170,30 @@ def test_tiles_drawn_apart_fit_to_the_last_bit(flown: tuple[list[PosedFrame], Al
             tile = whole.window(whole.col0 + col, whole.row0 + row, 640, 512)
             alone = render(tile, WORLD, index.overlapping(tile, WORLD), album, params)
             assert np.array_equal(alone, drawn[row : row + 512, col : col + 640])
+
+
+@pytest.mark.parametrize("bands", [3, 4, 5])
+def test_what_was_not_warped_is_not_read(
+    flown: tuple[list[PosedFrame], Album], monkeypatch: pytest.MonkeyPatch, bands: int
+) -> None:
+    """Cells outside of `needed` hold whatever memory held: no pixel may depend on it."""
+    frames, album = flown
+    grid, params, rng = middle(1280, 512), FusionParams(bands=bands), np.random.default_rng(1)
+    clean = render(grid, WORLD, frames, album, params)
+    spoilt = []
+
+    def junk(
+        photo: Rgb, places: NDArray[np.int32], needed: NDArray[np.bool_], cell_px: int, cubic: bool
+    ) -> Rgb:
+        out = warp(photo, places, needed, cell_px, cubic)
+        idle = ~np.kron(needed, np.ones((cell_px, cell_px), bool))
+        out[idle] = rng.integers(0, 256, (int(idle.sum()), 3))
+        spoilt.append(int(idle.sum()))
+        return out
+
+    monkeypatch.setattr("core.fusion.warp", junk)
+    assert np.array_equal(render(grid, WORLD, frames, album, params), clean)
+    assert sum(spoilt) > 100_000
 
 
 def test_odd_windows_fit_too(flown: tuple[list[PosedFrame], Album]) -> None:
