@@ -58,7 +58,8 @@ class FormReader:
             raise BadUpload
         self.finished: list[ReceivedFile] = []
         self.fields: dict[str, bytes] = {}
-        self.files_begun = 0
+        self.late_fields: set[str] = set()  # those that came behind a photo
+        self._files_begun = 0
         self._folder = folder
         self._limit = max_file_bytes
         self._parts = 0
@@ -121,7 +122,7 @@ class FormReader:
         if filename is None and name != "files":
             self._field = (name, bytearray())
         else:
-            self.files_begun += 1
+            self._files_begun += 1
             self._file = _Incoming(clean_name(filename or ""), self._folder, self._limit)
 
     def _data(self, data: bytes, start: int, end: int) -> None:
@@ -139,6 +140,8 @@ class FormReader:
             self._file = None
         elif self._field:
             self.fields[self._field[0]] = bytes(self._field[1])
+            if self._files_begun:
+                self.late_fields.add(self._field[0])
             self._field = None
 
     def _end(self) -> None:

@@ -138,17 +138,18 @@ class _Upload:
             await to_thread.run_sync(self._reader.feed, lot)
         except OSError as error:
             raise as_ours(error) from error
-        self._read_telemetry()
-        finished, self._reader.finished = self._reader.finished, []
-        self._tasks += [asyncio.create_task(self._accept(file)) for file in finished]
+        finally:
+            self._read_telemetry()
+            finished, self._reader.finished = self._reader.finished, []
+            self._tasks += [asyncio.create_task(self._accept(file)) for file in finished]
 
     def _read_telemetry(self) -> None:
         raw = self._reader.fields.pop("telemetry", None)
-        if raw is None:
-            return
-        if self._tasks:
-            raise BadTelemetry('Send the field "telemetry" before the photos: some are accepted already.')
-        self._telemetry = _telemetry(raw)
+        # Small requests could be served in any order, large ones not: no order that works only sometimes.
+        if "telemetry" in self._reader.late_fields:
+            raise BadTelemetry('Send the field "telemetry" before the photos: each is accepted as it comes.')
+        if raw is not None:
+            self._telemetry = _telemetry(raw)
 
     async def _accept(self, file: ReceivedFile) -> _Result:
         known = (self._telemetry or {}).get(file.name)

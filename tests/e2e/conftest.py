@@ -25,7 +25,16 @@ from playwright.sync_api import Browser, sync_playwright
 from core import pyramid
 from core.frame import FrameMeta, GpsFix
 from core.geometry import Array, Camera, Pose, World
-from core.grid import TILE_PX, TileKey, ancestors, children, tile_bounds_lonlat, tile_grid, tiles_of, zoom_resolution_m
+from core.grid import (
+    TILE_PX,
+    TileKey,
+    ancestors,
+    children,
+    tile_bounds_lonlat,
+    tile_grid,
+    tiles_of,
+    zoom_resolution_m,
+)
 from core.terrain import Terrain, TerrainParams
 from services.catalog import frames, leases, missions, poses, tiles
 from services.catalog.poses import Placed, PoseUpdate
@@ -102,7 +111,9 @@ def service(tmp_path: Path) -> Iterator[Service]:
     settings.make_dirs()
     db = Database(settings.database_url)
     db.upgrade()
-    found = Service(f"http://127.0.0.1:{port}", settings.data_dir, db, FolderStore(Path(settings.storage_url)))
+    found = Service(
+        f"http://127.0.0.1:{port}", settings.data_dir, db, FolderStore(Path(settings.storage_url))
+    )
     found.start()
     try:
         yield found
