@@ -163,76 +163,90 @@ def _retone(
 
 
 @compiled
-def _label(
-    knot_labels: Labels,
-    weights: Int32,
-    n: int,
-    strict: bool,
-    places: Int32,
-    sizes: Int32,
-    out: Labels,
+def _contenders(
+    knot_labels: Labels, weights: Int32, j: int, i: int, found: NDArray[np.int64]
+) -> tuple[int, bool]:
+    """The winners at a patch's four knots, ascending, in `found`; whether all lie inside of their photos."""
+    count, inside = 0, True
+    for corner in range(4):
+        y, x = j + corner // 2, i + corner % 2
+        label = knot_labels[y, x]
+        if label < 0:
+            inside = False
+            continue
+        inside = inside and weights[label, y, x] >= INSIDE
+        known = False
+        for q in range(count):
+            known = known or found[q] == label
+        if not known:
+            found[count] = label
+            count += 1
+    found[:count].sort()
+    return count, inside
+
+
+@compiled
+def _contest(f: int, left: int, right: int, best: NDArray[np.int64], chosen: Labels) -> None:
+    """Let photo f compete for one row of a patch by its weight at the row's ends."""
+    n = len(best)
+    for x in range(n):
+        w = left * (2 * n - 2 * x - 1) + right * (2 * x + 1)
+        if w > best[x]:
+            best[x] = w
+            chosen[x] = f
+
+
+@compiled
+def _contest_held(
+    f: int, ends: NDArray[np.int64], bounds: NDArray[np.int64], best: NDArray[np.int64], chosen: Labels
 ) -> None:
-    rows, cols = knot_labels.shape
+    """Like `_contest`, only for the pixels that photo f truly holds.
+
+    `ends` (3, 2): weight, x and y at the row's left and right end; `bounds`: the largest x and y that count.
+    """
+    n = len(best)
+    for x in range(n):
+        near, far = 2 * n - 2 * x - 1, 2 * x + 1
+        w = ends[0, 0] * near + ends[0, 1] * far
+        a = ends[1, 0] * near + ends[1, 1] * far
+        b = ends[2, 0] * near + ends[2, 1] * far
+        held = a >= 0 and b >= 0 and a <= bounds[0] and b <= bounds[1]
+        if held and w > best[x]:
+            best[x] = w
+            chosen[x] = f
+
+
+@compiled
+def _label(
+    knot_labels: Labels, weights: Int32, n: int, strict: bool, places: Int32, sizes: Int32, out: Labels
+) -> None:
+    """Patch by patch between knots, in whole numbers: bilinear weights, scaled by (2n)²."""
     best, chosen = np.empty(n, np.int64), np.empty(n, np.int16)
-    found = np.empty(4, np.int64)
-    for j in range(rows - 1):
-        for i in range(cols - 1):
+    found, ends, bounds = np.empty(4, np.int64), np.zeros((3, 2), np.int64), np.zeros(2, np.int64)
+    for j in range(knot_labels.shape[0] - 1):
+        for i in range(knot_labels.shape[1] - 1):
             y0, x0 = j * n + n // 2, i * n + n // 2
-            count, pure = 0, True
-            for corner in range(4):
-                label = knot_labels[j + corner // 2, i + corner % 2]
-                if label < 0:
-                    pure = False
-                    continue
-                pure = pure and (weights[label, j + corner // 2, i + corner % 2] >= INSIDE or not strict)
-                known = False
-                for q in range(count):
-                    known = known or found[q] == label
-                if not known:
-                    found[count] = label
-                    count += 1
-            if count == 0:
-                continue
-            if count == 1 and pure:
+            count, inside = _contenders(knot_labels, weights, j, i, found)
+            if count == 1 and (inside or not strict):
                 out[y0 : y0 + n, x0 : x0 + n] = np.int16(found[0])
                 continue
-            found[:count].sort()
-            for y in range(n):
-                best[:] = 0
+            exact = strict and not inside
+            for y in range(n if count else 0):
+                best[:] = -1
                 chosen[:] = NOBODY
-                part = 2 * y + 1
+                upper, lower = 2 * n - 2 * y - 1, 2 * y + 1
                 for q in range(count):
                     f = found[q]
-                    w_left = weights[f, j, i] * (2 * n - part) + weights[f, j + 1, i] * part
-                    w_right = weights[f, j, i + 1] * (2 * n - part) + weights[f, j + 1, i + 1] * part
-                    if strict and not pure:
-                        p, r = places[f, j : j + 2, i : i + 2], sizes[f]
-                        a_left = p[0, 0, 0] * (2 * n - part) + p[1, 0, 0] * part
-                        a_right = p[0, 1, 0] * (2 * n - part) + p[1, 1, 0] * part
-                        b_left = p[0, 0, 1] * (2 * n - part) + p[1, 0, 1] * part
-                        b_right = p[0, 1, 1] * (2 * n - part) + p[1, 1, 1] * part
-                        last_a = (r[0] - 1) * 1024 * n * n
-                        last_b = (r[1] - 1) * 1024 * n * n
-                        for x in range(n):
-                            along = 2 * x + 1
-                            a = a_left * (2 * n - along) + a_right * along
-                            b = b_left * (2 * n - along) + b_right * along
-                            w = w_left * (2 * n - along) + w_right * along
-                            if (
-                                a >= 0
-                                and b >= 0
-                                and a <= last_a
-                                and b <= last_b
-                                and (chosen[x] < 0 or w > best[x])
-                            ):
-                                best[x] = w
-                                chosen[x] = f
+                    for side in range(2):
+                        ends[0, side] = weights[f, j, i + side] * upper + weights[f, j + 1, i + side] * lower
+                        for axis in range(2 if exact else 0):
+                            above, below = places[f, j, i + side, axis], places[f, j + 1, i + side, axis]
+                            ends[1 + axis, side] = above * upper + below * lower
+                            bounds[axis] = (sizes[f, axis] - 1) * 1024 * n * n
+                    if exact:
+                        _contest_held(f, ends, bounds, best, chosen)
                     else:
-                        for x in range(n):
-                            w = w_left * (2 * n - 2 * x - 1) + w_right * (2 * x + 1)
-                            if w > best[x]:
-                                best[x] = w
-                                chosen[x] = f
+                        _contest(f, ends[0, 0], ends[0, 1], best, chosen)
                 out[y0 + y, x0 : x0 + n] = chosen
 
 
