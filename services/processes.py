@@ -159,6 +159,8 @@ def _celery(queue: str, concurrency: int, stages: Iterable[str]) -> tuple[str, .
     return (
         *(
             sys.executable,
+            "-W",
+            "ignore:You're running the worker",  # as root in a container: nothing here is unpickled
             "-m",
             "celery",
             "-A",

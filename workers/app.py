@@ -39,7 +39,7 @@ store = get_store(settings)
 log = structlog.get_logger("workers")
 
 MAX_ATTEMPTS = 4
-CLAIM_TTL_S = 60.0
+CLAIM_TTL_S = settings.stalled_after_s
 """A tile that was handed out is handed out again after this time."""
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from core.coverage import Encoded, blocks, draw_block
 from core.grid import TileKey
-from services.catalog import missions, poses, tiles
+from services.catalog import backlog, missions, poses, tiles
 from services.catalog.poses import Poses
 from services.catalog.tiles import TileBox
 from services.queue import send
@@ -22,8 +22,11 @@ before_the_fork(warmup.rendering)
 def fuse(mission_id: str, keys: Sequence[Sequence[int]]) -> None:
     """Render these tiles from the newest poses and hand them to publish."""
     clock = Stopwatch()
-    for block in blocks(TileKey(*key) for key in keys):
+    for claimed in blocks(TileKey(*key) for key in keys):
         with db.read() as tx:
+            block = [TileKey(*key) for key in backlog.unrendered(tx, mission_id, claimed)]
+            if not block:
+                continue  # this task ran before, or somebody else was faster
             mission = missions.get(tx, mission_id)
             known = poses.load(tx, mission_id, _box(block))
         photos = MissionPhotos(shelf, mission_id, mission.max_side)

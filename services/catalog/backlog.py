@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import func, or_, select
+from sqlalchemy import ColumnElement, func, or_, select, tuple_
 from sqlalchemy.orm import Session
 
-from services.catalog.rows import clock
+from services.catalog.rows import chunks, clock
+from services.catalog.tiles import Key
 from services.tables import DirtyTile, Frame
 
 
@@ -30,7 +32,7 @@ def of(tx: Session, mission_id: str, ttl_s: float, now: float | None = None) -> 
         Frame.mission_id == mission_id, Frame.state.in_(("received", "ready", "matched"))
     )
     frames = {state: count for state, count in tx.execute(by_state.group_by(Frame.state))}
-    to_do = or_(DirtyTile.rendered_generation.is_(None), DirtyTile.rendered_generation < DirtyTile.generation)
+    to_do = _to_do()
     claimed = DirtyTile.claimed_at > clock(now) - ttl_s
     query = select(
         func.count().filter(to_do, claimed),
@@ -40,3 +42,20 @@ def of(tx: Session, mission_id: str, ttl_s: float, now: float | None = None) -> 
     in_flight, to_render, to_publish = tx.execute(query).one()
     unread = frames.get("received", 0) + frames.get("ready", 0)
     return Backlog(unread, frames.get("matched", 0), in_flight, to_render, to_publish)
+
+
+def unrendered(tx: Session, mission_id: str, keys: Collection[Key]) -> Sequence[Key]:
+    """Those of these tiles that show, or wait to show, older poses than they should; sorted."""
+    found: list[Key] = []
+    for some in chunks(sorted((z, x, y) for z, x, y in keys)):
+        query = select(DirtyTile.z, DirtyTile.x, DirtyTile.y).where(
+            DirtyTile.mission_id == mission_id,
+            tuple_(DirtyTile.z, DirtyTile.x, DirtyTile.y).in_(some),
+            _to_do(),
+        )
+        found += [(z, x, y) for z, x, y in tx.execute(query)]
+    return sorted(found)
+
+
+def _to_do() -> ColumnElement[bool]:
+    return or_(DirtyTile.rendered_generation.is_(None), DirtyTile.rendered_generation < DirtyTile.generation)
