@@ -1,4 +1,4 @@
-"""Poses of all frames from their matches and their GPS: the planar-restricted pose graph of Zhao 2020, 3.3."""
+"""Poses of all frames from matches and GPS: the planar-restricted pose graph of Zhao 2020, 3.3."""
 
 from core.pose_graph.model import GraphFrame, PoseParams, Solution
 from core.pose_graph.placing import place

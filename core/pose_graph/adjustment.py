@@ -13,7 +13,7 @@ from core.pose_graph.elimination import Border, solve_blocks
 from core.pose_graph.priors import Priors, add_priors
 from core.pose_graph.residuals import Edges, Normal, State, linearise, retract
 
-# A step of less than this share of the height above ground (at the 95th percentile) moves no pixel of the map.
+# A step of less than this share of the height above ground (95th percentile) moves no pixel of the map.
 SETTLED = 1e-4
 HELD = 1e12
 

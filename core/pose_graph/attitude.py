@@ -23,7 +23,7 @@ def level_to_world(yaw: Array) -> Array:
 
 
 def levelling(down: Array) -> Array:
-    """The smallest rotations (N, 3, 3) that turn unit vectors `down` (N, 3), camera frame, onto the z axis."""
+    """The smallest rotations (N, 3, 3) that turn unit vectors `down` (N, 3) onto the z axis."""
     x, y, z = down[:, 0], down[:, 1], np.maximum(down[:, 2], -0.999)
     k = 1 / (1 + z)
     rows = (

@@ -2,8 +2,9 @@
 
 For a level camera, p = x − iy of the viewing ray, |z| is the height above ground, arg z the yaw and c the
 ground point below. A match says z_i·p_i + c_i = z_j·p_j + c_j, GPS says c_i: all linear, so that one sparse
-solve finds the global optimum; reweighting takes wrong matches and wrong GPS fixes out. This does for the plane
-what rotation averaging and scale averaging (Zhao 2020, eq. 1–4) do in space, and needs no baseline per pair.
+solve finds the global optimum; reweighting takes wrong matches and wrong GPS fixes out. This does for the
+plane what rotation averaging and scale averaging (Zhao 2020, eq. 1–4) do in space, and needs no baseline per
+pair.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ SETTLED = 0.003
 
 @dataclass(frozen=True, slots=True)
 class Similarities:
-    """Frames as similarities: `z` (N,) complex metres, `c` (N,) complex metres east + i·north; `error` (E,) RMS
-    disagreement of each pair as a share of the height above ground."""
+    """Frames as similarities: `z` (N,) complex metres, `c` (N,) complex metres east + i·north; `error` (E,)
+    RMS disagreement of each pair as a share of the height above ground.
+    """
 
     z: ComplexArray
     c: ComplexArray
@@ -84,8 +86,9 @@ def average(
 ) -> Similarities:
     """The robust least-squares similarities of all frames.
 
-    `gps`: (N,) complex metres, NaN where there is none; `gps_sigma` (N,). `roots`: frames held at z = `height_m`,
-    c = 0, one in each component that GPS does not hold. `height_m`: a guess; only the weight of matches hangs on it.
+    `gps`: (N,) complex metres, NaN where there is none; `gps_sigma` (N,). `roots`: frames held at z =
+    `height_m`, c = 0, one in each component that GPS does not hold. `height_m`: a guess; only the weight of
+    matches hangs on it.
     """
     n, known = len(gps), np.isfinite(gps)
     i, j = pairs[:, 0], pairs[:, 1]
@@ -137,7 +140,7 @@ def _pair_error(x: Array, i: IntArray, j: IntArray, m: Moments) -> Array:
 
 
 def fit_similarity(source: ComplexArray, target: ComplexArray, sigma: Array) -> tuple[complex, complex]:
-    """Scale-rotation s and shift d of target ≈ s·source + d, robust (Cauchy); s = 1 where points do not spread."""
+    """Scale-rotation s and shift d of target ≈ s·source + d, robust (Cauchy); s = 1 for a single place."""
     w = np.ones(len(source))
     s, d = 1.0 + 0j, 0j
     for _ in range(15):

@@ -1,4 +1,4 @@
-"""Sparse normal equations as a gtsam factor graph: one variable per frame, one border shared by all frames."""
+"""Sparse normal equations as a gtsam factor graph: a variable per frame, one border shared by all."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ class Border:
 def gaussian_graph(
     frame: Array, pairs: IntArray, pair: Array, rhs: Array, border: Border | None
 ) -> gtsam.GaussianFactorGraph:
-    """Blocks of H·x = g as HessianFactors: `frame` (N, d, d), `pair` (E, d, d) above the diagonal, `rhs` (N, d).
+    """Blocks of H·x = g as HessianFactors: `frame` (N, d, d), `pair` (E, d, d) above the diagonal, `rhs`
+    (N, d).
 
     A pair's factor carries only its block off the diagonal: its share of the diagonal is in `frame` already,
     and elimination sums all factors of a variable before it factorises.
@@ -58,7 +59,9 @@ def solve_blocks(
     border: Border | None = None,
     ordering: gtsam.Ordering | None = None,
 ) -> tuple[Array, Array, gtsam.Ordering] | None:
-    """The solution (N, d) and (B,), and the ordering for the next time; None where H is not positive definite."""
+    """The solution (N, d) and (B,), and the ordering for the next time; None where H is not positive
+    definite.
+    """
     graph = gaussian_graph(frame, pairs, pair, rhs, border)
     ordering = ordering or ordering_of(graph)
     n, d = rhs.shape

@@ -20,7 +20,8 @@ def gnss_poses(
     s: Survey, rows: IntArray, placed: Mapping[str, Pose], offset: Array, params: PoseParams
 ) -> dict[int, Pose]:
     """Poses of the frames `rows` that have GPS, from it, the heading and the ground below their `placed`
-    neighbours; `offset` (D,) corrects the yaw by drone, NaN = unknown."""
+    neighbours; `offset` (D,) corrects the yaw by drone, NaN = unknown.
+    """
     _, trusted = expected_down(s)
     visual = [(k, placed[f.frame_id]) for k, f in enumerate(s.frames) if f.frame_id in placed]
     visual = [(k, p) for k, p in visual if p.source == "visual"]

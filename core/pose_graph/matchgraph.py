@@ -81,7 +81,7 @@ def submaps(n: int, pairs: IntArray, ranks: Sequence[object]) -> IntArray:
 
 
 def flat_rays(edges: Edges, cameras: Sequence[Camera], level: Array) -> tuple[ComplexArray, ComplexArray]:
-    """The points of all pairs as x − iy of their rays, turned level by each frame's rotation `level` (N, 3, 3)."""
+    """The points of all pairs as x − iy of their rays, turned by each frame's `level` (N, 3, 3)."""
     rows = np.repeat(np.arange(len(edges)), np.diff(edges.starts))
     out = []
     for side in range(2):

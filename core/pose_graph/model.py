@@ -23,19 +23,21 @@ class PoseParams:
     """How much the pose graph believes in what. Lengths in metres, angles in radians.
 
     `points_per_edge`: correspondences kept of one image pair, spread evenly over the picture.
-    `independent_points`: how many of them count as independent, since relief errs in patches.
-    `sigma_of_f`: standard deviation of a correspondence on the ground plane, as a share of the focal length.
-    `robust_scale`: where the Cauchy loss starts to bend, in standard deviations.
-    `wrong_edge`: an edge whose median residual exceeds this many standard deviations (and this many
-    times the median edge) is taken for a wrong match. `…_start_…`: before a mission shows how good its GPS and
-    gimbal are; `…_floor_…`: the best that is believed of them afterwards. `min_downward`: cosine of the steepest
-    tilt by the gimbal that still makes a map photo; `oblique_ratio`: the furthest corner, in heights.
+    `independent_points`: how many of them count as independent, since relief errs in patches. `sigma_of_f`:
+    standard deviation of a correspondence on the ground plane, as a share of the focal length.
+    `sigma_range`: how many times that a mission's own residuals may make it. `robust_scale`: where the
+    Cauchy loss starts to bend, in standard deviations. `wrong_edge`: an edge whose median residual exceeds
+    this many standard deviations (and this many times the median edge) is taken for a wrong match.
+    `…_start_…`: before a mission shows how good its GPS and gimbal are; `…_floor_…`: the best that is
+    believed of them afterwards. `min_downward`: cosine of the steepest tilt by the gimbal that still makes a
+    map photo; `oblique_ratio`: the furthest corner, in heights.
     """
 
     points_per_edge: int = 32
     independent_points: float = 2.0
     coarse_points: int = 12
     min_points: int = 8
+    sigma_range: tuple[float, float] = (0.3, 6.0)
     sigma_of_f: float = 1.5e-3
     robust_scale: float = 2.0
     wrong_edge: float = 8.0
@@ -43,13 +45,13 @@ class PoseParams:
     gps_floor_m: float = 0.05
     altitude_sigma_m: float = 15.0
     ground_step_sigma_m: float = 3.0
-    gps_learnt_floor_m: float = 0.5
-    altitude_learnt_floor_m: float = 0.5
+    gps_learnt_floor_m: float = 0.3
+    altitude_learnt_floor_m: float = 0.3
     min_frames_to_learn: int = 8
     tilt_start_rad: float = 0.3
     tilt_floor_rad: float = 0.03
     gimbal_start_rad: float = 0.05
-    gimbal_sigma_rad: float = 0.006
+    gimbal_sigma_rad: float = 0.03
     yaw_sigma_rad: float = 0.5
     height_log_sigma: float = 0.4
     focal_log_sigma: float = 0.005

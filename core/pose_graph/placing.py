@@ -30,7 +30,9 @@ AGREES = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """One pair's view of a new frame as a similarity (ground = z·p + c): `z`, `c` complex metres, `h` of the ground."""
+    """One pair's view of a new frame as a similarity (ground = z·p + c): `z`, `c` complex metres, `h` of the
+    ground.
+    """
 
     z: complex
     c: complex
@@ -46,8 +48,8 @@ def place(
 ) -> Solution:
     """`solution` with the frames `new_ids` in it; every other pose stays as it is.
 
-    `frames`: at least the new ones and those they are matched with. A new frame that ties to nothing posed lies
-    where its GPS says. The result does not depend on the order of any argument.
+    `frames`: at least the new ones and those they are matched with. A new frame that ties to nothing posed
+    lies where its GPS says. The result does not depend on the order of any argument.
     """
     params = params or PoseParams()
     known = {f.frame_id: f for f in frames}
@@ -97,7 +99,7 @@ def _pose(
 
 
 def _around(known: dict[str, GraphFrame], frame_id: str, solution: Solution, params: PoseParams) -> set[str]:
-    """The frames of the same drone just before and after, for speed and heading, and the nearest posed ones."""
+    """The same drone's frames just before and after, for speed and heading, and the nearest posed ones."""
     me = known[frame_id]
     at = capture_order(me)
     same = [f for f in known.values() if f.meta.drone == me.meta.drone and f.frame_id != frame_id]
@@ -247,6 +249,7 @@ def _priors(
         drone=s.drone,
         anchor=state.t,
         down=down,
+        gimballed=believed_gimbal(s).astype(float),
         tilt_sigma=np.where(believed_gimbal(s), params.gimbal_start_rad, params.tilt_start_rad / 2),
         yaw=np.full(n, np.nan),
         yaw_sigma=np.full(n, params.yaw_sigma_rad),

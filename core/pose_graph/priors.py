@@ -18,10 +18,10 @@ ANCHOR_SIGMA_M = 300.0
 class Priors:
     """Per frame, NaN where there is none; sigmas in the unit of what they belong to.
 
-    `gps` (N, 3) m and `velocity` (N, 2) m/s with `drone` (N,); `anchor` (N, 3) m; `down` (N, 3) unit vector to
-    the earth in the camera's frame; `yaw` (N,) rad; `height` (N,) m above ground, its sigma in log units.
-    `ground_step_sigma_m`: between the two frames of a pair. `lens` (C, 3) px, 1, 1 with `lens_sigma` (C, 3) in
-    log f, k1, k2.
+    `gps` (N, 3) m and `velocity` (N, 2) m/s with `drone` (N,); `anchor` (N, 3) m; `down` (N, 3) unit vector
+    to the earth in the camera's frame, `gimballed` (N,) 1 where a gimbal says so and 0 where not; `yaw` (N,)
+    rad; `height` (N,) m above ground, its sigma in log units. `ground_step_sigma_m`: between the two frames
+    of a pair. `lens` (C, 3) px, 1, 1 with `lens_sigma` (C, 3) in log f, k1, k2.
     """
 
     gps: Array
@@ -31,6 +31,7 @@ class Priors:
     drone: IntArray
     anchor: Array
     down: Array
+    gimballed: Array
     tilt_sigma: Array
     yaw: Array
     yaw_sigma: Array
@@ -72,24 +73,48 @@ def _cauchy(squared: Array) -> tuple[Array, float]:
     return 1 / (1 + squared / 4), float(2 * np.log1p(squared / 4).sum())
 
 
+def nadir(p: Priors, state: State) -> tuple[Array, Array]:
+    """What GPS is held against (N, 2), world metres, and its Jacobian by the frame's unknowns (N, 2, 7).
+
+    The centre, or, for a camera whose gimbal is trusted, the ground that the gimbal says is right below it.
+    Matches cannot tell a tilted camera from tilted ground, and the level stitching plane makes all of it a
+    tilt. On a slope that would leave the centre in place and push the ground downhill by height × slope.
+    """
+    ray = np.einsum("nij,nj->ni", state.R, p.down)
+    down = np.minimum(ray[:, 2], -0.1)
+    reach = p.gimballed * (state.h - state.t[:, 2]) / down
+    lean = ray[:, :2] / down[:, None]
+    J = np.zeros((len(ray), 2, 7))
+    for k, axis in enumerate(np.eye(3)):
+        turned = np.einsum("nij,nj->ni", state.R, np.cross(axis, p.down))
+        J[:, :, k] = reach[:, None] * (turned[:, :2] - lean * turned[:, 2:])
+    J[:, 0, 3] = J[:, 1, 4] = 1.0
+    J[:, :, 5] = -p.gimballed[:, None] * lean
+    J[:, :, 6] = p.gimballed[:, None] * lean
+    return state.t[:, :2] + reach[:, None] * ray[:, :2], J
+
+
 def _add_position(p: Priors, state: State, n: Normal) -> float:
     lag_column = 3 * len(state.lens) + p.drone
     known = np.isfinite(p.gps[:, 0])
     aim = np.where(known[:, None], p.gps[:, :2] + p.velocity * state.lag_s[p.drone][:, None], 0.0)
-    miss = np.where(known[:, None], state.t[:, :2] - aim, 0.0)
+    at, J = nadir(p, state)
+    miss = np.where(known[:, None], at - aim, 0.0)
     weight, cost = _cauchy((miss**2).sum(1) / p.gps_sigma**2)
     w = np.where(known, weight / p.gps_sigma**2, 0.0)
+    n.frame[:] += w[:, None, None] * np.einsum("nki,nkj->nij", J, J)
+    n.frame_rhs[:] -= w[:, None] * np.einsum("nki,nk->ni", J, miss)
     rows = np.arange(len(w))
-    for axis in range(2):
-        v = p.velocity[:, axis]
-        n.frame[:, 3 + axis, 3 + axis] += w
-        n.frame_rhs[:, 3 + axis] -= w * miss[:, axis]
-        n.cross[rows, 3 + axis, lag_column] -= w * v
-        np.add.at(n.border, (lag_column, lag_column), w * v * v)
-        np.add.at(n.border_rhs, lag_column, w * v * miss[:, axis])
+    n.cross[rows, :, lag_column] -= w[:, None] * np.einsum("nki,nk->ni", J, p.velocity)
+    np.add.at(n.border, (lag_column, lag_column), w * (p.velocity**2).sum(1))
+    np.add.at(n.border_rhs, lag_column, w * (p.velocity * miss).sum(1))
+    return cost + _add_altitude(p, state, n)
+
+
+def _add_altitude(p: Priors, state: State, n: Normal) -> float:
     up = np.isfinite(p.gps[:, 2])
     rise = np.where(up, state.t[:, 2] - np.where(up, p.gps[:, 2], 0.0), 0.0)
-    weight, cost_up = _cauchy(rise**2 / p.altitude_sigma**2)
+    weight, cost = _cauchy(rise**2 / p.altitude_sigma**2)
     w = np.where(up, weight / p.altitude_sigma**2, 0.0)
     n.frame[:, 5, 5] += w
     n.frame_rhs[:, 5] -= w * rise
@@ -97,7 +122,7 @@ def _add_position(p: Priors, state: State, n: Normal) -> float:
     for axis in range(3):
         n.frame[:, 3 + axis, 3 + axis] += 1 / ANCHOR_SIGMA_M**2
         n.frame_rhs[:, 3 + axis] -= pull[:, axis]
-    return cost + cost_up + float(0.5 * (pull * (state.t - p.anchor)).sum())
+    return cost + float(0.5 * (pull * (state.t - p.anchor)).sum())
 
 
 def _add_tilt(p: Priors, state: State, n: Normal) -> float:

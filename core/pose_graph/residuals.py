@@ -1,9 +1,9 @@
 """The planar-restricted reprojection factor (Zhao 2020, eq. 6–9), one call for all image pairs.
 
 A correspondence (u_i, u_j) gives the ray a = R_i·Proj⁻¹(u_i), the ground point p = t_i + a·(h_i − t_iz)/a_z,
-the residual Proj(R_jᵀ(p − t_j)) − u_j, and the same with i and j swapped. Per frame seven unknowns: a rotation
-vector ω in the camera's own frame (R ← R·exp(ω)), the centre t and the ground height h; per camera three:
-log f, k1, k2. Compiled, because a mission has a million correspondences and ten linearisations.
+the residual Proj(R_jᵀ(p − t_j)) − u_j, and the same with i and j swapped. Per frame seven unknowns: a
+rotation vector ω in the camera's own frame (R ← R·exp(ω)), the centre t and the ground height h; per camera
+three: log f, k1, k2. Compiled, because a mission has a million correspondences and ten linearisations.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Edges:
         return len(self.pairs)
 
     def thinned(self, limit: int) -> Edges:
-        """The same pairs with at most `limit` points each, every k-th of them, and their weight made up for."""
+        """The same pairs with every k-th point, at most `limit` each, weighing as much together."""
         counts = np.diff(self.starts)
         rank = np.arange(len(self.uv)) - np.repeat(self.starts[:-1], counts)
         wide = np.repeat(counts, counts)
@@ -70,7 +70,8 @@ class Edges:
 @dataclass(frozen=True, slots=True)
 class State:
     """The unknowns: `R` (N, 3, 3) world_R_cam, `t` (N, 3) and `h` (N,) metres, `lens` (C, 3) = f px, k1, k2,
-    `lag_s` (D,) seconds by drone."""
+    `lag_s` (D,) seconds by drone.
+    """
 
     R: Array
     t: Array
@@ -81,8 +82,9 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """Normal equations H·x = g in blocks: frames (N, 7, 7), pairs (E, 7, 7), and a border (cameras, lags) of B
-    unknowns that touches every frame. `cost` is the robust cost they were taken at."""
+    """Normal equations H·x = g in blocks: frames (N, 7, 7), pairs (E, 7, 7), and a border (cameras, lags) of
+    B unknowns that touches every frame. `cost` is the robust cost they were taken at.
+    """
 
     frame: Array
     pair: Array
@@ -112,8 +114,8 @@ def _observe(
     """One directed residual and its Jacobian, out = 2 rows of J (2, 16) and 2 of `out`; False when the ray
     misses the ground.
 
-    The columns of J are those that differ: ω_i (3), ω_j (3), the shift east and north, the slope of the ray, up,
-    lens i (3), lens j (3); `_spread_columns` makes the unknowns' columns of them.
+    The columns of J are those that differ: ω_i (3), ω_j (3), the shift east and north, the slope of the ray,
+    up, lens i (3), lens j (3); `_spread_columns` makes the unknowns' columns of them.
     """
     # undistort: r_d = r (1 + k1 r² + k2 r⁴), by Newton
     f, k1, k2 = li[0], li[1], li[2]
@@ -172,7 +174,9 @@ def _observe(
 
 
 def _spread_columns(first: int, second: int, lens_first: int, lens_second: int) -> Array:
-    """(16, 20): columns of `_observe` → unknowns of a pair (frame, frame, lens, lens), each block's offset given."""
+    """(16, 20): columns of `_observe` → unknowns of a pair (frame, frame, lens, lens), each block's offset
+    given.
+    """
     T = np.zeros((16, 20))
     for k in range(3):
         T[k, first + k] = 1.0
@@ -205,8 +209,9 @@ def _accumulate(
     R: Array, t: Array, h: Array, lens: Array, sigma: Array, scale: float, spread: Array,
     H: Array, g: Array, squared: Array,
 ) -> float:  # fmt: skip
-    """Each pair's normal equations H (E, 20, 20) and g (E, 20), in place; the robust cost. `sigma` (C,) px, `scale`
-    of the Cauchy loss in sigmas; `squared` (M, 2) takes the squared residuals in sigmas."""
+    """Each pair's normal equations H (E, 20, 20) and g (E, 20), in place; the robust cost. `sigma` (C,) px,
+    `scale` of the Cauchy loss in sigmas; `squared` (M, 2) takes the squared residuals in sigmas.
+    """
     longest = 0
     for e in range(len(pairs)):
         longest = max(longest, starts[e + 1] - starts[e])
@@ -284,12 +289,13 @@ _scatter = _compile(_scatter)
 
 
 def linearise(edges: Edges, state: State, sigma_px: Array, robust_scale: float) -> Normal:
-    """The normal equations of all image pairs at `state`. `sigma_px`: (C,) of one correspondence, by camera."""
+    """The normal equations of all pairs at `state`. `sigma_px`: (C,) of one correspondence, by camera."""
     n, e, c = len(state.R), len(edges), CAMERA_DOF * len(state.lens)
     b = c + len(state.lag_s)
     H, g, squared = np.zeros((e, 20, 20)), np.zeros((e, 20)), np.zeros((len(edges.uv), 2))
     cost = _accumulate(
-        edges.pairs, edges.starts, edges.uv, edges.weight, edges.camera, state.R, state.t, state.h, state.lens,
+        edges.pairs, edges.starts, edges.uv, edges.weight, edges.camera,
+        state.R, state.t, state.h, state.lens,
         sigma_px, robust_scale, SPREAD, H, g, squared,
     )  # fmt: skip
     frame, pair, cross = np.zeros((n, 7, 7)), np.zeros((e, 7, 7)), np.zeros((n, 7, b))

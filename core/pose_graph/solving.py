@@ -15,12 +15,15 @@ from core.pose_graph.adjustment import Adjusted, adjust
 from core.pose_graph.fallback import gnss_poses, is_oblique
 from core.pose_graph.matchgraph import edges_of, submaps
 from core.pose_graph.model import GraphFrame, PoseParams, Solution
-from core.pose_graph.priors import Priors, gravity, heading
+from core.pose_graph.priors import Priors, gravity, heading, nadir
 from core.pose_graph.residuals import Edges, IntArray, State
 from core.pose_graph.start import Start, expected_down, starting, yaw_offsets
 from core.pose_graph.survey import Survey, survey
 
 WILD = 10.0
+MIN_OPPOSITE = 10
+# Median of |x| and of a plane vector's length → standard deviation per axis.
+MEDIAN_1D, MEDIAN_2D = 1.4826, 1.1774
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +36,7 @@ class Graph:
     adjusted: Adjusted
     dropped: tuple[tuple[str, str], ...]
     gps_sigma: Array
+    sigma_px: Array
 
 
 def solve(
@@ -72,13 +76,16 @@ def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
     coarse = adjust(thin, held, start.state, sigma, 5 * params.robust_scale, params.coarse_steps, 5e-3)
     good = _right_edges(thin, coarse.squared, params.wrong_edge)
     edges = edges.subset(good)
-    priors = _learnt(tied, priors, coarse.state, params)
+    # relief makes most of the residuals: what this ground does decides how far a match is believed
+    observed = float(np.sqrt(np.median(coarse.squared))) / MEDIAN_2D
+    sigma = sigma * np.clip(observed, *params.sigma_range)
+    priors = _learnt(tied, edges.pairs, priors, coarse.state, params)
     fine = adjust(edges, priors, coarse.state, sigma, params.robust_scale, params.fine_steps, 3e-4)
     left = {tuple(p) for p in edges.pairs.tolist()}
     ids = [f.frame_id for f in tied.frames]
     dropped = tuple((ids[i], ids[j]) for i, j in every.pairs.tolist() if (i, j) not in left)
     fine = replace(fine, steps=fine.steps + coarse.steps)
-    return Graph(tied, rows, edges, fine, dropped, priors.gps_sigma)
+    return Graph(tied, rows, edges, fine, dropped, priors.gps_sigma, sigma)
 
 
 def _right_edges(edges: Edges, squared: Array, limit: float) -> NDArray[np.bool_]:
@@ -96,7 +103,8 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
     loose = ~start.held_by_gps[submap]
     yaw = s.attitude[:, 0] + np.nan_to_num(start.yaw_offset[s.drone])
     yaw = np.where(np.isfinite(yaw), yaw, heading(start.state.R))
-    # where GPS cannot tell scale or heading its fixes only say where the middle is, and that the start has used
+    # where GPS cannot tell scale or heading its fixes only say where the middle is, and that the start has
+    # used
     gps = s.gps.copy()
     gps[loose & s.has_gps, :2] = start.state.t[loose & s.has_gps, :2]
     c = len(s.cameras)
@@ -113,6 +121,7 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
         drone=s.drone,
         anchor=start.state.t,
         down=down,
+        gimballed=known.astype(float),
         tilt_sigma=np.where(known, params.gimbal_start_rad, params.tilt_start_rad),
         yaw=np.where(loose, yaw, np.nan),
         yaw_sigma=np.full(len(s), params.yaw_sigma_rad),
@@ -126,36 +135,61 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
     )
 
 
-def _learnt(s: Survey, priors: Priors, state: State, params: PoseParams) -> Priors:
+def _learnt(s: Survey, pairs: IntArray, priors: Priors, state: State, params: PoseParams) -> Priors:
     """Priors after the coarse adjustment: how good each drone's GPS is, and how its camera is mounted."""
     gps_sigma, altitude_sigma = priors.gps_sigma.copy(), priors.altitude_sigma.copy()
-    down, tilt = priors.down.copy(), priors.tilt_sigma.copy()
-    _, known = expected_down(s)
-    # what a gimbal or an airframe adds to the expected direction, in the camera's own frame
-    lean = (gravity(state.R) - priors.down)[:, :2]
-    miss = state.t - priors.gps
+    miss = np.column_stack((nadir(priors, state)[0], state.t[:, 2])) - priors.gps
     for d in range(len(s.drones)):
         mine = (s.drone == d) & s.has_gps
         if mine.sum() >= params.min_frames_to_learn:
-            observed = max(float(np.median(np.hypot(*miss[mine, :2].T))) / 1.177, params.gps_learnt_floor_m)
+            observed = max(
+                float(np.median(np.hypot(*miss[mine, :2].T))) / MEDIAN_2D, params.gps_learnt_floor_m
+            )
             stated = s.gps_sigma[mine] < params.gps_sigma_m
             gps_sigma[mine] = np.where(stated, np.maximum(s.gps_sigma[mine], observed), observed)
         high = mine & np.isfinite(miss[:, 2])
         if high.sum() >= params.min_frames_to_learn:
-            observed = 1.48 * float(np.median(np.abs(miss[high, 2] - np.median(miss[high, 2]))))
+            observed = MEDIAN_1D * float(np.median(np.abs(miss[high, 2] - np.median(miss[high, 2]))))
             observed = min(max(observed, params.altitude_learnt_floor_m), params.altitude_sigma_m)
-            altitude_sigma[high] = np.maximum(np.minimum(s.altitude_sigma[high], observed), observed)
-        for c, gimbal in product(np.unique(s.camera), (True, False)):
-            group = (s.drone == d) & (s.camera == c) & (known == gimbal)
-            if group.sum() < params.min_frames_to_learn:
-                continue
-            middle = np.median(lean[group], axis=0)
-            off = float(np.median(np.linalg.norm(lean[group] - middle, axis=1))) / 1.177
-            down[group, :2] += middle
-            # half, since the scatter is mostly that of an adjustment that was still free to tilt
-            tilt[group] = max(params.gimbal_sigma_rad, off / 2) if gimbal else max(params.tilt_floor_rad, off)
+            altitude_sigma[high] = observed
+    return _mounted(
+        s, pairs, replace(priors, gps_sigma=gps_sigma, altitude_sigma=altitude_sigma), state, params
+    )
+
+
+def _mounted(s: Survey, pairs: IntArray, priors: Priors, state: State, params: PoseParams) -> Priors:
+    """What a gimbal or an airframe adds to the expected way down, in the camera's own frame; and, where no
+    gimbal tells, how much of the tilt is the ground's.
+    """
+    down, tilt, known = priors.down.copy(), priors.tilt_sigma.copy(), priors.gimballed > 0
+    lean = (gravity(state.R) - priors.down)[:, :2]
+    for d, c, gimbal in product(range(len(s.drones)), np.unique(s.camera), (True, False)):
+        group = (s.drone == d) & (s.camera == c) & (known == gimbal)
+        if group.sum() < params.min_frames_to_learn:
+            continue
+        middle = np.median(lean[group], axis=0)
+        off = float(np.median(np.linalg.norm(lean[group] - middle, axis=1))) / MEDIAN_2D
+        down[group, :2] += middle
+        tilt[group] = params.gimbal_sigma_rad if gimbal else max(params.tilt_floor_rad, off)
     down /= np.linalg.norm(down, axis=1, keepdims=True)
-    return replace(priors, gps_sigma=gps_sigma, altitude_sigma=altitude_sigma, down=down, tilt_sigma=tilt)
+    slope = _share_of_ground(pairs[~known[pairs[:, 0]] & ~known[pairs[:, 1]]], down, state)
+    return replace(priors, down=down, tilt_sigma=tilt, gimballed=np.where(known, 1.0, slope))
+
+
+def _share_of_ground(pairs: IntArray, down: Array, state: State) -> float:
+    """How much of the cameras' tilt comes from sloping ground (0 … 1).
+
+    A slope tilts two neighbours to the same side of the world even when they fly in opposite directions; what
+    the airframe does differs from photo to photo or turns with its heading.
+    """
+    tilt = np.einsum("nij,nj->ni", state.R, down)[:, :2]
+    yaw = heading(state.R)
+    opposite = pairs[np.cos(yaw[pairs[:, 0]] - yaw[pairs[:, 1]]) < -0.5]
+    if len(opposite) < MIN_OPPOSITE:
+        return 0.0
+    first, second = tilt[opposite[:, 0]], tilt[opposite[:, 1]]
+    spread = float(((first**2).sum() + (second**2).sum()) / 2)
+    return float(np.clip((first * second).sum() / max(spread, 1e-12), 0.0, 1.0))
 
 
 def _solution(s: Survey, graph: Graph | None, params: PoseParams) -> Solution:
@@ -212,7 +246,9 @@ def refined(camera: Camera, lens: Array) -> Camera:
 
 
 def _visual(s: Survey, graph: Graph, label: IntArray) -> dict[str, Pose]:
-    """Poses of the tied frames whose submap has a place: GPS somewhere in it, or no GPS in the whole mission."""
+    """Poses of the tied frames whose submap has a place: GPS somewhere in it, or no GPS in the whole
+    mission.
+    """
     state = graph.adjusted.state
     nowhere = not s.has_gps.any()
     size = np.bincount(label)
@@ -236,9 +272,7 @@ def _visual(s: Survey, graph: Graph, label: IntArray) -> dict[str, Pose]:
 def reprojection_rms(graph: Graph, params: PoseParams) -> float:
     """Pixels of the original photos, over all correspondences but the wild ones."""
     squared, edges = graph.adjusted.squared, graph.edges
-    if not len(edges.uv):
-        return 0.0
-    f = graph.adjusted.state.lens[graph.s.camera, 0] * params.sigma_of_f
-    target = np.repeat(f[edges.pairs[:, ::-1]], np.diff(edges.starts), axis=0)
+    camera = graph.s.camera[edges.pairs[:, ::-1]]
+    target = np.repeat(graph.sigma_px[camera], np.diff(edges.starts), axis=0)
     tame = squared < (WILD * params.robust_scale) ** 2
     return float(np.sqrt((squared * target**2)[tame].mean())) if tame.any() else 0.0

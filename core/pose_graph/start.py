@@ -25,7 +25,8 @@ HORIZONTAL_RAD = -0.6
 class Start:
     """`state` of all frames; `held_by_gps` (S,) by submap whether GPS gives it scale and heading; `height`
     (N,) expected metres above ground; `edge_error` (E,) share of the height; `yaw_offset` by drone, NaN if
-    unknown."""
+    unknown.
+    """
 
     state: State
     held_by_gps: NDArray[np.bool_]
@@ -45,7 +46,9 @@ def believed_gimbal(s: Survey) -> NDArray[np.bool_]:
 
 
 def expected_down(s: Survey) -> tuple[Array, NDArray[np.bool_]]:
-    """Each camera's direction to the earth (N, 3) by its gimbal, straight ahead where that is not known (N,)."""
+    """Each camera's direction to the earth (N, 3) by its gimbal, straight ahead where that is not known
+    (N,).
+    """
     known = believed_gimbal(s)
     pitch, roll = s.attitude[:, 1], s.attitude[:, 2]
     pitch, roll = np.where(known, pitch, -np.pi / 2), np.where(known & np.isfinite(roll), roll, 0.0)

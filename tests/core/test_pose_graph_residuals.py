@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from core.pose_graph import priors as prior_terms
 from core.pose_graph import residuals
 from core.pose_graph.attitude import level_to_world, levelling
 from core.pose_graph.matchgraph import spread, submaps
+from core.pose_graph.priors import Priors
 from core.pose_graph.residuals import Edges, State, linearise, retract, rotations
 
 STEP = 1e-6
@@ -97,6 +100,52 @@ def test_heading_jacobian_is_its_derivative(state: State) -> None:
         behind = prior_terms.heading(state.R @ rotations(-step))
         numeric = prior_terms.wrapped(ahead - behind) / (2 * STEP)
         np.testing.assert_allclose(analytic[:, axis], numeric, atol=1e-6)
+
+
+def believed(state: State) -> Priors:
+    rng = np.random.default_rng(7)
+    down = prior_terms.gravity(state.R) + rng.normal(0, 0.05, (2, 3))
+    ones = np.ones(2)
+    return Priors(
+        gps=state.t + rng.normal(0, 3, (2, 3)),
+        gps_sigma=2 * ones,
+        altitude_sigma=3 * ones,
+        velocity=rng.normal(0, 5, (2, 2)),
+        drone=np.zeros(2, int),
+        anchor=state.t + 5,
+        down=down / np.linalg.norm(down, axis=1, keepdims=True),
+        gimballed=np.array([1.0, 0.4]),
+        tilt_sigma=0.05 * ones,
+        yaw=prior_terms.heading(state.R) + 0.3,
+        yaw_sigma=0.5 * ones,
+        height=np.array([50.0, 70.0]),
+        height_sigma=0.2 * ones,
+        ground_step_sigma_m=1.5,
+        lens=state.lens * (1.01, 0.9, 1.1),
+        lens_sigma=np.full((2, 3), 0.05),
+        lag_sigma_s=0.3,
+    )
+
+
+def test_gradient_of_the_priors_is_the_derivative_of_their_cost(state: State) -> None:
+    priors, pairs = believed(state), np.array([[0, 1]])
+    empty = Edges(pairs[:0], np.zeros(1, int), np.zeros((0, 4)), np.ones(0), np.array([0, 1]))
+
+    def at(moved: State) -> tuple[float, residuals.Normal]:
+        normal = linearise(empty, moved, np.ones(2), 2.0)
+        blank = replace(normal, pair=np.zeros((1, 7, 7)))
+        return prior_terms.add_priors(priors, pairs, moved, blank), blank
+
+    normal = at(state)[1]
+    analytic = np.concatenate((normal.frame_rhs.reshape(-1), normal.border_rhs))
+    for column in range(21):
+        costs = []
+        for sign in (1, -1):
+            step = np.zeros(21)
+            step[column] = sign * STEP
+            costs.append(at(retract(state, step[:14].reshape(2, 7), step[14:]))[0])
+        numeric = (costs[0] - costs[1]) / (2 * STEP)
+        assert -analytic[column] == pytest.approx(numeric, rel=1e-4, abs=1e-4), column
 
 
 def test_levelling_turns_the_way_down_onto_the_axis() -> None:
