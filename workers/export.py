@@ -9,13 +9,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from core.archives import TileSet, write_folder, write_mbtiles, write_pmtiles
+from core.cog import DEFAULT as MOSAIC
+from core.cog import mosaic_grid
 from core.coverage import mission_gsd_m
 from core.errors import NothingToMap, OrthostreamError
 from core.exports import NamedFrame, footprints_geojson, json_bytes, poses_document, route_csv, write_mosaic
 from core.geometry import PosedFrame, World
-from services.catalog import exports, frames, missions, poses
+from core.grid import TileKey, utm_epsg
+from core.preview import Preview, preview, write_preview
+from core.pyramid import JPEG
+from core.stac import stac_item
+from core.superoverlay import write_kmz
+from services.catalog import exports, frames, missions, poses, tiles
 from services.catalog.frames import Seen
 from services.catalog.poses import Poses
+from services.export_names import crs_of
 from services.report import report
 from services.tables import Export, Mission
 from workers.app import Stopwatch, db, log, settings, stage, store
@@ -26,9 +35,14 @@ MEDIA_TYPES = {
     ".json": "application/json",
     ".geojson": "application/geo+json",
     ".csv": "text/csv",
+    ".png": "image/png",
+    ".zip": "application/zip",
+    ".pmtiles": "application/vnd.pmtiles",
+    ".mbtiles": "application/vnd.sqlite3",
+    ".kmz": "application/vnd.google-earth.kmz",
 }
 
-Maker = Callable[[Path, Mission], None]
+Maker = Callable[[Path, Mission, Export], None]
 
 
 @stage("export")
@@ -73,11 +87,12 @@ def _alone(mission_id: str, name: str) -> Iterator[bool]:
 
 def _made(mission: Mission, wanted: Export) -> tuple[str, int]:
     """The file's key in the store, and its bytes."""
-    if wanted.name not in MAKERS:
+    make = _mosaic if crs_of(wanted.name) else MAKERS.get(wanted.name)
+    if make is None:
         raise OrthostreamError(f"{wanted.name} cannot be made by this version.")
     with TemporaryDirectory(dir=settings.data_dir / "exports", prefix="making-") as folder:
         path = Path(folder) / wanted.name
-        MAKERS[wanted.name](path, mission)
+        make(path, mission, wanted)
         key = f"missions/{mission.id}/exports/{wanted.revision}-{wanted.generation}/{wanted.name}"
         store.put_file(key, path)
         return key, os.stat(path).st_size
@@ -101,34 +116,81 @@ def _placed(mission: Mission) -> tuple[World, list[NamedFrame]]:
     return known.world, named
 
 
-def _mosaic(path: Path, mission: Mission) -> None:
+def _mosaic(path: Path, mission: Mission, wanted: Export) -> None:
     world, named = _placed(mission)
     drawn: list[PosedFrame] = [n.posed for n in named]
     gsd_m = mission_gsd_m(drawn, mission.max_side)
-    write_mosaic(path, world, drawn, MissionPhotos(shelf, mission.id, mission.max_side), gsd_m)
+    photos = MissionPhotos(shelf, mission.id, mission.max_side)
+    write_mosaic(path, world, drawn, photos, gsd_m, crs_of(wanted.name))
 
 
-def _poses(path: Path, mission: Mission) -> None:
+def _poses(path: Path, mission: Mission, _wanted: Export) -> None:
     path.write_bytes(json_bytes(poses_document(*_placed(mission))))
 
 
-def _footprints(path: Path, mission: Mission) -> None:
+def _footprints(path: Path, mission: Mission, _wanted: Export) -> None:
     path.write_bytes(json_bytes(footprints_geojson(*_placed(mission))))
 
 
-def _route(path: Path, mission: Mission) -> None:
+def _route(path: Path, mission: Mission, _wanted: Export) -> None:
     path.write_text(route_csv(*_placed(mission)))
 
 
-def _report(path: Path, mission: Mission) -> None:
+def _report(path: Path, mission: Mission, _wanted: Export) -> None:
     with db.read() as tx:
         path.write_bytes(json_bytes(report(tx, mission.id)))
 
 
+def _stac(path: Path, mission: Mission, _wanted: Export) -> None:
+    world, named = _placed(mission)
+    drawn: list[PosedFrame] = [n.posed for n in named]
+    gsd_m = mission_gsd_m(drawn, mission.max_side)
+    if gsd_m is None:
+        raise NothingToMap
+    grid = mosaic_grid(world, drawn, gsd_m, MOSAIC.max_pixels)
+    item = stac_item(mission.id, mission.name, world, named, grid, mission.created_at)
+    path.write_bytes(json_bytes(item))
+
+
+def _tiles(mission: Mission, wanted: Export) -> TileSet:
+    """The map at the revision that was asked for, however it has grown since. Raises NothingToMap."""
+    with db.read() as tx:
+        shown = {TileKey(*t.key): t for t in tiles.at(tx, mission.id, wanted.revision)}
+    keys = {key: t.object_key for key, t in shown.items() if t.object_key is not None}
+    kinds = {key: t.media_type or JPEG for key, t in shown.items()}
+    return TileSet(mission.name, kinds, lambda tile: store.get(keys[tile]))
+
+
+def _archive(write: Callable[[Path, TileSet], None]) -> Maker:
+    return lambda path, mission, wanted: write(path, _tiles(mission, wanted))
+
+
+def _picture(mission: Mission, wanted: Export) -> Preview:
+    shown, world = _tiles(mission, wanted), mission.world
+    if world is None:
+        raise NothingToMap
+    return preview(shown, utm_epsg(world["lat_deg"], world["lon_deg"]))
+
+
+def _preview_png(path: Path, mission: Mission, wanted: Export) -> None:
+    path.write_bytes(_picture(mission, wanted).png())
+
+
+def _preview_zip(path: Path, mission: Mission, wanted: Export) -> None:
+    write_preview(path, _picture(mission, wanted))
+
+
 MAKERS: dict[str, Maker] = {
     "mosaic.tif": _mosaic,
-    "poses.json": _poses,
-    "report.json": _report,
+    "preview.png": _preview_png,
+    "preview.zip": _preview_zip,
+    "tiles.pmtiles": _archive(write_pmtiles),
+    "tiles.mbtiles": _archive(write_mbtiles),
+    "tiles.zip": _archive(write_folder),
+    "map.kmz": _archive(write_kmz),
+    "stac.json": _stac,
     "footprints.geojson": _footprints,
+    "poses.json": _poses,
     "route.csv": _route,
+    "report.json": _report,
 }

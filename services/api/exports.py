@@ -5,22 +5,26 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
-from typing import Any, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from sqlalchemy.orm import Session
 
+from core.errors import BadCrs
 from services.api.context import MissionId, Services, Use
 from services.api.documents import ExportList, ExportOut, export_document
 from services.api.problems import ExportFailed
 from services.catalog import exports, missions
+from services.export_names import MOSAIC, NAMES, ExportName, mosaic_in
 from services.tables import Export
 
 router = APIRouter(tags=["exports"])
 
-NAMES = ("mosaic.tif", "poses.json", "report.json", "footprints.geojson", "route.csv", "tiles.pmtiles")
-Name = Literal["mosaic.tif", "poses.json", "report.json", "footprints.geojson", "route.csv", "tiles.pmtiles"]
+Crs = Annotated[
+    str | None,
+    Query(pattern=r"^EPSG:[0-9]{4,6}$", description="Of the mosaic, where not the UTM zone of the mission"),
+]
 
 # While the map still grows an export this old is as good as a new one: else one could never fetch any.
 _FRESH_S = 60.0
@@ -48,22 +52,37 @@ def list_exports(mission_id: MissionId, services: Use) -> ExportList:
 @router.get("/missions/{mission_id}/exports/{name}", response_class=Response, responses=_ANSWERS)
 @router.head("/missions/{mission_id}/exports/{name}", include_in_schema=False)
 def get_export(
-    mission_id: MissionId, name: Name, request: Request, services: Use, retry: bool = False
+    mission_id: MissionId,
+    name: ExportName,
+    request: Request,
+    services: Use,
+    retry: bool = False,
+    crs: Crs = None,
 ) -> Response:
     """The file (200), or 202 while it is made. One that failed stays failed until the map changes or `retry`.
 
     Of a map that still grows it shows the state of at most a minute ago.
     """
+    file = _named(name, crs)
     with services.db.write() as tx:
-        export, wanted = _request(tx, mission_id, name, retry)
+        export, wanted = _request(tx, mission_id, file, retry)
     if wanted:
-        services.send("export", mission_id, name)
+        services.send("export", mission_id, file)
     if export.state == "failed":
         raise ExportFailed(export.error)
     if export.state != "ready" or export.object_key is None:
-        document = export_document(name, export, _url(mission_id, name))
+        url = _url(mission_id, name) + (f"?crs={crs}" if crs else "")
+        document = export_document(file, export, url)
         return JSONResponse(document.model_dump(), 202, headers={"Retry-After": str(_RETRY_S)})
-    return _send(services, request, export, f"{mission_id}-{name}")
+    return _send(services, request, export, f"{mission_id}-{file}")
+
+
+def _named(name: ExportName, crs: str | None) -> str:
+    if crs is None:
+        return name
+    if name != MOSAIC:
+        raise BadCrs(f"Only {MOSAIC} can be had in another CRS.")
+    return mosaic_in(crs)
 
 
 def _request(tx: Session, mission_id: str, name: str, retry: bool) -> tuple[Export, bool]:

@@ -257,6 +257,22 @@ def current(tx: Session, mission_id: str, keys: Collection[Key]) -> Mapping[Key,
     return found
 
 
+def at(tx: Session, mission_id: str, revision: int) -> Sequence[StoredTile]:
+    """Every tile that showed something at `revision`, as it was then, sorted."""
+    columns = (TileVersion.mission_id, TileVersion.z, TileVersion.x, TileVersion.y)
+    newest = (
+        select(*columns, func.max(TileVersion.revision))
+        .where(TileVersion.mission_id == mission_id, TileVersion.revision <= revision)
+        .group_by(*columns)
+    )
+    query = (
+        select(TileVersion)
+        .where(tuple_(*columns, TileVersion.revision).in_(newest), TileVersion.object_key.is_not(None))
+        .order_by(TileVersion.z, TileVersion.x, TileVersion.y)
+    )
+    return [_stored(row) for row in tx.scalars(query.execution_options(yield_per=1000))]
+
+
 def keys(tx: Session, mission_id: str, z: int | None = None) -> Sequence[Key]:
     """The tiles that show something now, sorted; `z`: of this zoom only."""
     query = select(Tile.z, Tile.x, Tile.y).where(Tile.mission_id == mission_id, Tile.object_key.is_not(None))

@@ -13,11 +13,17 @@ const STATE: Record<MissionState, [label: string, tone: string]> = {
 
 const EXPORT_TITLES: Record<string, [title: string, hint: string]> = {
   "mosaic.tif": ["Orthophoto", "Cloud-optimised GeoTIFF"],
-  "poses.json": ["Camera poses", "JSON, UTM"],
+  "preview.png": ["Preview", "PNG, 2048 px"],
+  "preview.zip": ["Preview, georeferenced", "PNG with world file"],
+  "tiles.pmtiles": ["Map tiles", "PMTiles"],
+  "tiles.mbtiles": ["Map tiles", "MBTiles"],
+  "tiles.zip": ["Map tiles", "XYZ folder, zip"],
+  "map.kmz": ["Google Earth", "KMZ super-overlay"],
+  "stac.json": ["Catalogue entry", "STAC item"],
   "footprints.geojson": ["Footprints", "GeoJSON"],
+  "poses.json": ["Camera poses", "JSON, UTM"],
   "route.csv": ["Flight route", "CSV"],
   "report.json": ["Report", "JSON"],
-  "tiles.pmtiles": ["Map tiles", "PMTiles"],
 };
 
 export interface PanelActions {
