@@ -104,9 +104,14 @@ class Client:
         """Asks for the final map."""
         self._json("POST", f"/missions/{mission_id}/finalise")
 
-    def download(self, mission_id: str, name: str, path: Path, wait: Callable[[], None]) -> bool:
-        """Fetches one export into `path`, calling `wait` while it is made; False when it cannot be made."""
-        url = f"/missions/{mission_id}/exports/{name}"
+    def download(
+        self, mission_id: str, name: str, path: Path, wait: Callable[[], None], crs: str | None = None
+    ) -> bool:
+        """Fetches one export into `path`, calling `wait` while it is made; False when it cannot be made.
+
+        `crs`: of the mosaic, where not the mission's UTM zone.
+        """
+        url = f"/missions/{mission_id}/exports/{name}" + (f"?crs={crs}" if crs else "")
         while True:
             answer = self._ask("GET", url, headers={"Range": "bytes=0-0"})
             if answer.status_code == 409:

@@ -15,8 +15,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from core.errors import NothingToMap, OrthostreamError
 from services.cli.client import Client, Uploaded
 from services.cli.flight import Photo, identify
+from services.export_names import MOSAIC
 
-EXPORTS = ("poses.json", "report.json", "footprints.geojson", "route.csv", "mosaic.tif")
+EXPORTS = ("poses.json", "report.json", "footprints.geojson", "route.csv", "tiles.pmtiles", MOSAIC)
 PARALLEL = 4
 POLL_S = 0.25
 STUCK_S = 900.0
@@ -134,22 +135,23 @@ def follow(
         time.sleep(POLL_S)
 
 
-def deliver(client: Client, mission_id: str, out: Path, console: Console) -> None:
+def deliver(client: Client, mission_id: str, out: Path, console: Console, crs: str | None = None) -> None:
     """Downloads the exports of a finished mission. Raises NothingToMap, with what was wrong."""
-    if "mosaic.tif" in fetch(client, mission_id, out, console):
+    if MOSAIC in fetch(client, mission_id, out, console, crs):
         return
     lines = [f"  {f['name']}: {f['reason']}" for f in client.frames(mission_id, "rejected")]
     more = [f"  … and {len(lines) - SHOWN} more"] if len(lines) > SHOWN else []
     raise NothingToMap("\n".join(["There is no map to make of these photos:", *lines[:SHOWN], *more]))
 
 
-def fetch(client: Client, mission_id: str, out: Path, console: Console) -> list[str]:
+def fetch(client: Client, mission_id: str, out: Path, console: Console, crs: str | None = None) -> list[str]:
     """Downloads every export that can be made; their names."""
     out.mkdir(parents=True, exist_ok=True)
     with console.status("Writing the exports …") as status:
         fetched = []
         for name in EXPORTS:
             status.update(f"Writing {name} …")
-            if client.download(mission_id, name, out / name, lambda: None):
+            of = crs if name == MOSAIC else None
+            if client.download(mission_id, name, out / name, lambda: None, of):
                 fetched.append(name)
         return fetched

@@ -20,6 +20,7 @@ from services.cli.client import Client
 from services.cli.flight import Photo, find_photos
 from services.cli.mapping import Screen, Tally, deliver, follow, upload_all
 from services.cli.serve import embedded_stack
+from services.export_names import mosaic_in
 
 HOME = ".orthostream"
 
@@ -36,6 +37,9 @@ def run(
     max_side: Annotated[
         int | None, typer.Option(help="Longest side in pixels to work on; all unless set.")
     ] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="Of mosaic.tif, as EPSG:3857; else the flight's UTM zone.")
+    ] = None,
     server: Annotated[
         str | None, typer.Option(help="URL of a running orthostream; else one is started.")
     ] = None,
@@ -45,6 +49,8 @@ def run(
     """Map a folder of photos. Run again, it continues where it stopped."""
     if mode not in ("visual", "gnss"):
         raise typer.BadParameter("it is visual or gnss", param_hint="--mode")
+    if crs:
+        mosaic_in(crs)  # a wrong one shall not show after an hour's work
     console = Console(stderr=False)
     found = find_photos(photos)
     points = read_gcp(gcp) if gcp else None
@@ -52,7 +58,7 @@ def run(
         client = Client(url)
         try:
             mission_id = _mission(client, out / HOME, photos, mode, max_side)
-            map_photos(client, mission_id, found, out, console, 1 / pace if pace else 0.0)
+            map_photos(client, mission_id, found, out, console, 1 / pace if pace else 0.0, crs)
             if points:
                 add_checkpoints(points, photos, out)
             summary(out, console, f"{url}/missions/{mission_id}" if keep or server else None)
@@ -106,7 +112,13 @@ def _mission(client: Client, home: Path, photos: Path, mode: str, max_side: int 
 
 
 def map_photos(
-    client: Client, mission_id: str, photos: Sequence[Photo], out: Path, console: Console, pace_s: float = 0.0
+    client: Client,
+    mission_id: str,
+    photos: Sequence[Photo],
+    out: Path,
+    console: Console,
+    pace_s: float = 0.0,
+    crs: str | None = None,
 ) -> None:
     """Everything from the first upload to the last export. Raises NothingToMap."""
     tally = Tally()
@@ -127,7 +139,7 @@ def map_photos(
             raise failed[0]
         client.finalise(mission_id)
         follow(client, mission_id, tally, screen, lambda state: state == "final")
-    deliver(client, mission_id, out, console)
+    deliver(client, mission_id, out, console, crs)
 
 
 def summary(out: Path, console: Console, url: str | None) -> None:
