@@ -72,6 +72,10 @@ class PoseParams:
 class Solution:
     """Poses of one mission at one moment.
 
+    A pose is that of a camera over a level plane: where the ground slopes, camera and ground are turned
+    about the point that the camera looks down on until the ground is level, so that pixels lie right on the
+    map; the centre then departs from the drone's by height × slope.
+
     `cameras`: refined, by `FrameMeta.camera_key`. `poses`: by frame id. `unplaced`: frame id → error code of
     `core.errors`. `reprojection_rms_px`: over the correspondences of all trusted pairs, in pixels of the
     original photos, wild ones (beyond ten robust standard deviations) left out. `dropped_pairs`: (low, high)

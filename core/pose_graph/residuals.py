@@ -107,46 +107,26 @@ def rotations(omega: Array) -> Array:
     return np.asarray(np.eye(3) + s * K + (1 - c) * (K @ K))
 
 
-def _observe(
-    d0: float, d1: float, e0: float, e1: float,
-    Ri: Array, ti: Array, hi: float, li: Array, Rj: Array, tj: Array, lj: Array, J: Array, out: Array,
-) -> bool:  # fmt: skip
-    """One directed residual and its Jacobian, out = 2 rows of J (2, 16) and 2 of `out`; False when the ray
-    misses the ground.
-
-    The columns of J are those that differ: ω_i (3), ω_j (3), the shift east and north, the slope of the ray,
-    up, lens i (3), lens j (3); `_spread_columns` makes the unknowns' columns of them.
+def _undistorted(d0: float, d1: float, lens: Array) -> tuple[float, float, float, float]:
+    """The ray's x, y, its distortion factor and r² of a pixel from the principal point: Newton on
+    r_d = r (1 + k1 r² + k2 r⁴).
     """
-    # undistort: r_d = r (1 + k1 r² + k2 r⁴), by Newton
-    f, k1, k2 = li[0], li[1], li[2]
+    f, k1, k2 = lens[0], lens[1], lens[2]
     xd, yd = d0 / f, d1 / f
     rd = (xd * xd + yd * yd) ** 0.5
-    rr = rd
+    r = rd
     for _ in range(4):
-        q = rr * rr
-        rr -= (rr * (1 + k1 * q + k2 * q * q) - rd) / max(1 + 3 * k1 * q + 5 * k2 * q * q, 0.2)
-    r2 = rr * rr
+        q = r * r
+        r -= (r * (1 + k1 * q + k2 * q * q) - rd) / max(1 + 3 * k1 * q + 5 * k2 * q * q, 0.2)
+    r2 = r * r
     s = 1 + k1 * r2 + k2 * r2 * r2
-    x, y = xd / s, yd / s
-    ax = Ri[0, 0] * x + Ri[0, 1] * y + Ri[0, 2]
-    ay = Ri[1, 0] * x + Ri[1, 1] * y + Ri[1, 2]
-    az = Ri[2, 0] * x + Ri[2, 1] * y + Ri[2, 2]
-    if az > -MIN_DOWN or ti[2] - hi < 0.1:
-        return False
-    lam = (hi - ti[2]) / az
-    bx, by = ax / az, ay / az
-    px, py, pz = ti[0] + lam * ax - tj[0], ti[1] + lam * ay - tj[1], hi - tj[2]
-    q0 = Rj[0, 0] * px + Rj[1, 0] * py + Rj[2, 0] * pz
-    q1 = Rj[0, 1] * px + Rj[1, 1] * py + Rj[2, 1] * pz
-    q2 = Rj[0, 2] * px + Rj[1, 2] * py + Rj[2, 2] * pz
-    if q2 < MIN_DOWN * (ti[2] - hi):
-        return False
-    u, v = q0 / q2, q1 / q2
-    g, m1, m2 = lj[0], lj[1], lj[2]
-    w2 = u * u + v * v
-    sj = 1 + m1 * w2 + m2 * w2 * w2
-    mj = 2 * (m1 + 2 * m2 * w2)
-    out[0], out[1] = g * sj * u - e0, g * sj * v - e1
+    return xd / s, yd / s, s, r2
+
+
+    def _derive( Ri: Array, li: Array, Rj: Array, x: float, y: float, s: float, r2: float, lam: float, bx:
+    float, by: float, q0: float, q1: float, q2: float, u: float, v: float, w2: float, sj: float, mj: float,
+    g: float, J: Array, ) -> None:  # fmt: skip
+    """The Jacobian J (2, 16) of `_observe`, from its intermediate values."""
     # d(pixel)/d(q) = g (sj I + mj y yᵀ) [I | −y] / q2
     a00, a01, a11 = g * (sj + mj * u * u) / q2, g * mj * u * v / q2, g * (sj + mj * v * v) / q2
     for k in range(2):
@@ -166,10 +146,43 @@ def _observe(
         J[k, 6], J[k, 7], J[k, 8] = w0, w1, slope
         J[k, 9] = p0 * Rj[2, 0] + p1 * Rj[2, 1] + p2 * Rj[2, 2]
         # lens i: every parameter scales the ray's (x, y); lens j: the picture
-        along = -(c0 * x + c1 * y) / (s + 2 * (k1 + 2 * k2 * r2) * r2)
+        along = -(c0 * x + c1 * y) / (s + 2 * (li[1] + 2 * li[2] * r2) * r2)
         y_k = g * (u if k == 0 else v)
         J[k, 10], J[k, 11], J[k, 12] = along * s, along * r2, along * r2 * r2
         J[k, 13], J[k, 14], J[k, 15] = y_k * sj, y_k * w2, y_k * w2 * w2
+
+
+def _observe(
+    d0: float, d1: float, e0: float, e1: float,
+    Ri: Array, ti: Array, hi: float, li: Array, Rj: Array, tj: Array, lj: Array, J: Array, out: Array,
+) -> bool:  # fmt: skip
+    """One directed residual and its Jacobian, out = 2 rows of J (2, 16) and 2 of `out`; False when the ray
+    misses the ground.
+
+    The columns of J are those that differ: ω_i (3), ω_j (3), the shift east and north, the slope of the ray,
+    up, lens i (3), lens j (3); `_spread_columns` makes the unknowns' columns of them.
+    """
+    x, y, s, r2 = _undistorted(d0, d1, li)
+    ax = Ri[0, 0] * x + Ri[0, 1] * y + Ri[0, 2]
+    ay = Ri[1, 0] * x + Ri[1, 1] * y + Ri[1, 2]
+    az = Ri[2, 0] * x + Ri[2, 1] * y + Ri[2, 2]
+    if az > -MIN_DOWN or ti[2] - hi < 0.1:
+        return False
+    lam = (hi - ti[2]) / az
+    bx, by = ax / az, ay / az
+    px, py, pz = ti[0] + lam * ax - tj[0], ti[1] + lam * ay - tj[1], hi - tj[2]
+    q0 = Rj[0, 0] * px + Rj[1, 0] * py + Rj[2, 0] * pz
+    q1 = Rj[0, 1] * px + Rj[1, 1] * py + Rj[2, 1] * pz
+    q2 = Rj[0, 2] * px + Rj[1, 2] * py + Rj[2, 2] * pz
+    if q2 < MIN_DOWN * (ti[2] - hi):
+        return False
+    u, v = q0 / q2, q1 / q2
+    g, m1, m2 = lj[0], lj[1], lj[2]
+    w2 = u * u + v * v
+    sj = 1 + m1 * w2 + m2 * w2 * w2
+    mj = 2 * (m1 + 2 * m2 * w2)
+    out[0], out[1] = g * sj * u - e0, g * sj * v - e1
+    _derive(Ri, li, Rj, x, y, s, r2, lam, bx, by, q0, q1, q2, u, v, w2, sj, mj, g, J)
     return True
 
 
@@ -283,6 +296,8 @@ _compile: Callable[[Any], Any] = numba.njit(
     cache=True, nogil=True, error_model="numpy", fastmath={"contract"}
 )
 observe = _observe  # the plain Python function, for tests
+_undistorted = _compile(_undistorted)
+_derive = _compile(_derive)
 _observe = _compile(_observe)
 _accumulate = _compile(_accumulate)
 _scatter = _compile(_scatter)
