@@ -123,9 +123,11 @@ def _undistorted(d0: float, d1: float, lens: Array) -> tuple[float, float, float
     return xd / s, yd / s, s, r2
 
 
-    def _derive( Ri: Array, li: Array, Rj: Array, x: float, y: float, s: float, r2: float, lam: float, bx:
-    float, by: float, q0: float, q1: float, q2: float, u: float, v: float, w2: float, sj: float, mj: float,
-    g: float, J: Array, ) -> None:  # fmt: skip
+def _derive(
+    Ri: Array, li: Array, Rj: Array, x: float, y: float, s: float, r2: float, lam: float,
+    bx: float, by: float, q0: float, q1: float, q2: float,
+    u: float, v: float, w2: float, sj: float, mj: float, g: float, J: Array,
+) -> None:  # fmt: skip
     """The Jacobian J (2, 16) of `_observe`, from its intermediate values."""
     # d(pixel)/d(q) = g (sj I + mj y yᵀ) [I | −y] / q2
     a00, a01, a11 = g * (sj + mj * u * u) / q2, g * mj * u * v / q2, g * (sj + mj * v * v) / q2
