@@ -20,7 +20,7 @@ import rasterio
 from PIL import Image
 
 PROGRAM = [sys.executable, "-m", "services.cli"]
-FILES = {"mosaic.tif", "poses.json", "report.json", "footprints.geojson", "route.csv"}
+FILES = {"mosaic.tif", "tiles.pmtiles", "poses.json", "report.json", "footprints.geojson", "route.csv"}
 
 
 def orthostream(*arguments: Path | str) -> subprocess.CompletedProcess[str]:
