@@ -174,6 +174,11 @@ def _shot(drone: int, k: int, x: float, y: float) -> Shot:
     return Shot(frame_id, name, meta, Pose(rotation, center, 0.0))
 
 
+@pytest.fixture
+def shots() -> list[Shot]:
+    return flight()
+
+
 @dataclass
 class Mission:
     """A mission whose rows and tiles the test makes itself, as the workers would."""
@@ -183,6 +188,8 @@ class Mission:
     posed: list[Shot] = field(default_factory=list)
     epoch: int = 0
     pictures: dict[TileKey, NDArray[np.uint8]] = field(default_factory=dict)
+    changed: set[TileKey] = field(default_factory=set)  # by the last publication
+    light: float = 1.0
 
     @property
     def url(self) -> str:
@@ -217,10 +224,11 @@ class Mission:
         native = {TileKey(d.z, d.x, d.y): d.generation for d in dirty}
         newest = max(native.values())
         for key in native:
-            self.pictures[key] = _picture(key, self.posed)
+            self.pictures[key] = (_picture(key, self.posed) * [*[self.light] * 3, 1]).astype(np.uint8)
         above = ancestors(native, ZOOM - 8)
         for key in above:
             self.pictures[key] = pyramid.reduce([self.pictures.get(c) for c in children(key)])
+        self.changed = {*native, *above}
         rendered = [self._store(key, generation, revision + 1) for key, generation in native.items()]
         changes = rendered + [self._store(key, newest, revision + 1) for key in above]
         with self.service.db.write() as tx:
@@ -264,7 +272,7 @@ _TERRAIN = Terrain(TerrainParams(seed=5))
 
 
 def _picture(key: TileKey, shots: Sequence[Shot]) -> NDArray[np.uint8]:
-    """What the flight has seen of one native tile: the made-up countryside, transparent where nobody looked."""
+    """One native tile of the made-up countryside, transparent where nobody has looked yet."""
     grid = tile_grid(key)
     mask = Image.new("L", (TILE_PX, TILE_PX))
     for shot in shots:

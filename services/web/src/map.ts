@@ -114,6 +114,8 @@ export class MissionMap {
     this.map.on("movestart", (event) => {
       if ("originalEvent" in event && event.originalEvent) this.setFollowing(false);
     });
+    // A tile that the server could not send is asked for again with the next change; nobody needs the console.
+    this.map.on("error", (event) => console.warn(event.error.message));
     this.map.on("sourcedata", (event) => this.recheck(event));
     this.loaded = new Promise((resolve) => void this.map.once("load", () => resolve()));
   }
@@ -197,7 +199,7 @@ export class MissionMap {
   private flush(): void {
     this.frameRequest = 0;
     const overdue = performance.now() - OVERDUE_MS;
-    const now = [...this.changed].filter(([name]) => (this.underWay.get(name) ?? 0) <= overdue);
+    const now = [...this.changed].filter(([name]) => (this.underWay.get(name) ?? -Infinity) <= overdue);
     this.changed.clear();
     const tiles = now.map(([, [z, x, y]]) => ({ z, x, y }));
     if (tiles.length && this.map.getSource("tiles")) this.map.refreshTiles("tiles", tiles);

@@ -169,7 +169,8 @@ export class MissionPage {
     this.panel.setLegend(colourDrones(frames), sourceLegend(frames));
     this.placed = frames.features.length > 0;
     this.showEmpty();
-    await this.map.showFrames(frames);
+    // Not waited for: the pause between two fetches is measured by what the server takes.
+    void this.map.showFrames(frames);
   }
 
   private async loadRejected(): Promise<void> {

@@ -95,7 +95,7 @@ export class Panel {
   constructor(private readonly actions: PanelActions) {
     this.finalise = h("button", { class: "primary", onclick: () => actions.finalise() }, icon(ICONS.check), "Finalise map");
     this.rejected.append(h("summary", {}, "Rejected photos", this.rejectedCount), this.rejectedList);
-    this.root = h("aside", { class: "panel", "aria-label": "Mission" }, this.head(), this.body());
+    this.root = h("aside", { class: "panel", "aria-label": "Mission" }, this.head(), this.body(), this.foot());
   }
 
   private head(): HTMLElement {
@@ -118,12 +118,6 @@ export class Panel {
   }
 
   private body(): HTMLElement {
-    const input = h("input", { type: "file", multiple: true, accept: "image/jpeg,image/tiff,.jpg,.jpeg,.tif,.tiff,.mpo", hidden: true });
-    input.addEventListener("change", () => {
-      this.actions.add([...(input.files ?? [])]);
-      input.value = "";
-    });
-    const choose = h("button", { class: "quiet", onclick: () => input.click() }, icon(ICONS.upload), "Add photos");
     return h(
       "div", { class: "panel-body" },
       h("dl", { class: "stages" }, ...Object.values(this.stages).map((s) => s.root)),
@@ -132,8 +126,17 @@ export class Panel {
         this.switch("Photo footprints", "footprint"), this.sources, this.switch("Flight tracks", "track"), this.drones),
       this.rejected,
       h("section", { class: "section" }, h("h2", {}, "Downloads"), this.downloads),
-      h("section", { class: "section actions" }, choose, input, this.finalise, this.uploadNote, this.finaliseHint),
     );
+  }
+
+  private foot(): HTMLElement {
+    const input = h("input", { type: "file", multiple: true, accept: "image/jpeg,image/tiff,.jpg,.jpeg,.tif,.tiff,.mpo", hidden: true });
+    input.addEventListener("change", () => {
+      this.actions.add([...(input.files ?? [])]);
+      input.value = "";
+    });
+    const choose = h("button", { class: "quiet", onclick: () => input.click() }, icon(ICONS.upload), "Add photos");
+    return h("footer", { class: "panel-foot" }, choose, input, this.finalise, this.uploadNote, this.finaliseHint);
   }
 
   private switch(label: string, layer: "footprint" | "track"): HTMLElement {
@@ -174,7 +177,9 @@ export class Panel {
     if (!this.bar.children.length) for (const [name] of parts) this.bar.append(h("span", { class: name }));
     parts.forEach(([, n], i) => {
       const segment = this.bar.children[i];
-      if (segment instanceof HTMLElement) segment.style.width = total ? `${(100 * n) / total}%` : "0";
+      if (!(segment instanceof HTMLElement)) return;
+      segment.style.width = total ? `${(100 * n) / total}%` : "0";
+      segment.hidden = n === 0;
     });
   }
 
