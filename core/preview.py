@@ -14,8 +14,6 @@ from pyproj import CRS
 from rasterio.enums import Resampling
 from rasterio.transform import array_bounds
 from rasterio.warp import reproject, transform_bounds
-from rasterio.windows import Window
-from rasterio.windows import transform as window_transform
 
 from core.archives import TileSet, write_zip
 from core.grid import EQUATOR_M, TILE_PX, TileKey
@@ -41,8 +39,8 @@ class Preview:
     def world_file(self) -> str:
         """Six lines: the pixel's size and rotation, then the centre of the first pixel."""
         t = self.transform
-        x, y = t * (0.5, 0.5)
-        return "".join(f"{float(v)!r}\n" for v in (t.a, t.d, t.b, t.e, x, y))
+        values = t.a, t.d, t.b, t.e, t.c + (t.a + t.b) / 2, t.f + (t.d + t.e) / 2
+        return "".join(f"{float(v)!r}\n" for v in values)
 
     def projection(self) -> str:
         """The CRS in the words of .prj files, which world files lack."""
@@ -112,5 +110,5 @@ def _cropped(rgba: Rgba, transform: rasterio.Affine) -> tuple[Rgba, rasterio.Aff
         return rgba, transform
     top, left = int(rows[0]), int(columns[0])
     height, width = int(rows[-1]) + 1 - top, int(columns[-1]) + 1 - left
-    moved = window_transform(Window(left, top, width, height), transform)
+    moved = rasterio.Affine.translation(left * transform.a, top * transform.e) @ transform
     return np.ascontiguousarray(rgba[top : top + height, left : left + width]), moved

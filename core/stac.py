@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
@@ -42,7 +43,7 @@ def stac_item(
     start, end = (datetime.fromtimestamp(round(s, 3), UTC) for s in (times[0], times[-1]))
     item = Item(
         id=item_id,
-        geometry=shapely.geometry.mapping(shape),
+        geometry=json.loads(shapely.to_geojson(shape)),
         bbox=list(shape.bounds),
         datetime=start,
         properties={"title": title, "gsd": round(grid.gsd_m, 5)},
