@@ -24,14 +24,15 @@ def fuse(mission_id: str, keys: Sequence[Sequence[int]]) -> None:
     clock = Stopwatch()
     for claimed in blocks(TileKey(*key) for key in keys):
         with db.read() as tx:
-            block = [TileKey(*key) for key in backlog.unrendered(tx, mission_id, claimed)]
+            wanted = backlog.unrendered(tx, mission_id, claimed)
+            block = [TileKey(*key) for key in wanted]
             if not block:
                 continue  # this task ran before, or somebody else was faster
             mission = missions.get(tx, mission_id)
             known = poses.load(tx, mission_id, _box(block))
         photos = MissionPhotos(shelf, mission_id, mission.max_side)
         pictures = drawn(block, known, photos)
-        renders = [put_tile(store, mission_id, known.generation, t, p) for t, p in pictures.items()]
+        renders = [put_tile(store, mission_id, wanted[t], t, p) for t, p in pictures.items()]
         with db.write() as tx:
             tiles.record_renders(tx, mission_id, renders)
             clock.spend(tx, mission_id, "fuse")

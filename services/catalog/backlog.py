@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, func, or_, select, tuple_
@@ -44,17 +44,20 @@ def of(tx: Session, mission_id: str, ttl_s: float, now: float | None = None) -> 
     return Backlog(unread, frames.get("matched", 0), in_flight, to_render, to_publish)
 
 
-def unrendered(tx: Session, mission_id: str, keys: Collection[Key]) -> Sequence[Key]:
-    """Those of these tiles that show, or wait to show, older poses than they should; sorted."""
-    found: list[Key] = []
+def unrendered(tx: Session, mission_id: str, keys: Collection[Key]) -> Mapping[Key, int]:
+    """Those of these tiles that are to be rendered, sorted: each with the generation it then shows.
+
+    Read it in the same transaction as the poses: those are as new as that generation, or newer.
+    """
+    found: dict[Key, int] = {}
     for some in chunks(sorted((z, x, y) for z, x, y in keys)):
-        query = select(DirtyTile.z, DirtyTile.x, DirtyTile.y).where(
+        query = select(DirtyTile.z, DirtyTile.x, DirtyTile.y, DirtyTile.generation).where(
             DirtyTile.mission_id == mission_id,
             tuple_(DirtyTile.z, DirtyTile.x, DirtyTile.y).in_(some),
             _to_do(),
         )
-        found += [(z, x, y) for z, x, y in tx.execute(query)]
-    return sorted(found)
+        found |= {(z, x, y): generation for z, x, y, generation in tx.execute(query)}
+    return dict(sorted(found.items()))
 
 
 def _to_do() -> ColumnElement[bool]:
