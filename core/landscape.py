@@ -26,7 +26,7 @@ class LandscapeParams:
 
     seed: int = 0
     size_m: float = 4096.0
-    monotony: float = 0.15
+    monotony: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -86,7 +86,7 @@ class FlightParams:
     vignetting: float = 0.18
     sensor_noise: float = 1.6
     cars: int = 0
-    monotony: float = 0.15
+    monotony: float = 0.0
     seed: int = 0
     lat_deg: float = 47.26
     lon_deg: float = 17.35

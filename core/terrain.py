@@ -30,7 +30,7 @@ class TerrainParams:
 
     seed: int = 0
     relief_m: float = 0.0
-    monotony: float = 0.15
+    monotony: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
