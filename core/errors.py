@@ -67,13 +67,13 @@ class FarFromMission(RejectedFrame):
 
 
 class NotPlaceable(RejectedFrame):
-    """The photo has no usable GPS and ties to no other photo, so that nothing says where it belongs."""
+    """The photo has no usable GPS and ties to no other photo. Fly with more overlap, or send its position."""
 
     code = "not_placeable"
 
 
 class Oblique(RejectedFrame):
-    """The photo shows the horizon or looks so far sideways that no map can be drawn from it."""
+    """The photo shows the horizon or looks too far sideways for a map. Point the camera straight down."""
 
     code = "oblique"
 

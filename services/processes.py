@@ -124,7 +124,7 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         raise StackFailed(
-            f"Cannot listen on {host}:{port} ({error.strerror}). Choose another --port."
+            f"Cannot listen on {host}:{port} ({error.strerror}). Choose another --host or --port."
         ) from error
     listener.listen(512)
     return listener

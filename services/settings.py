@@ -8,9 +8,9 @@ import stat
 import tempfile
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from core.photo import PhotoLimits
@@ -56,6 +56,14 @@ class Settings(BaseSettings):
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_json: bool = False
+
+    def __init__(self, **given: Any) -> None:
+        """`given` stands above the environment. Raises BadSettings, which names what is wrong."""
+        try:
+            super().__init__(**given)
+        except ValidationError as error:
+            wrong = [f"{'.'.join(map(str, e['loc']))} is {e['input']!r}: {e['msg']}" for e in error.errors()]
+            raise BadSettings(f"A setting cannot be used. {'; '.join(wrong)}.") from error
 
     @model_validator(mode="after")
     def _fill_in(self) -> Self:

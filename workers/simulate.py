@@ -142,7 +142,10 @@ def main(arguments: list[str] | None = None) -> None:
         params = FlightParams(**options)
     except ValueError as problem:
         parser().error(str(problem))
-    done = simulate(params, out, jobs or len(os.sched_getaffinity(0)), events, truth)
+    try:
+        done = simulate(params, out, jobs or len(os.sched_getaffinity(0)), events, truth)
+    except OSError as problem:
+        parser().exit(2, f"orthostream simulate: cannot write to {out}: {problem.strerror or problem}\n")
     print(json.dumps(done), flush=True)
 
 

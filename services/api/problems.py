@@ -169,8 +169,8 @@ async def _ours(request: Request, error: Exception) -> JSONResponse:
 async def _invalid(_request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     errors = [{"where": [str(part) for part in e["loc"]], "detail": e["msg"]} for e in error.errors()]
-    where = ", ".join(".".join(e["where"][1:]) or e["where"][0] for e in errors)
-    return problem(422, "invalid_request", f"The request is not as it should be: {where}.", errors)
+    said = "; ".join(f"{'.'.join(e['where'][1:]) or e['where'][0]}: {e['detail']}" for e in errors)
+    return problem(422, "invalid_request", f"The request is not as it should be. {said}.", errors)
 
 
 async def _http(_request: Request, error: Exception) -> JSONResponse:

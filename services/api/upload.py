@@ -164,8 +164,12 @@ def _check_room(services: Services, mission_id: str) -> None:
     with services.db.read() as tx:
         missions.get(tx, mission_id)
     # Before the first byte is read: a full disk must not cost the sender an upload.
-    if shutil.disk_usage(services.uploads).free < services.settings.min_free_bytes:
-        raise OutOfDisk
+    free, kept = shutil.disk_usage(services.uploads).free, services.settings.min_free_bytes
+    if free < kept:
+        raise OutOfDisk(
+            f"The server's disk has only {free / 1e6:.0f} MB left, of {kept / 1e6:.0f} MB that are "
+            "kept for the map. Free some space, then upload again: nothing was lost."
+        )
 
 
 def _accept(services: Services, mission_id: str, file: ReceivedFile, telemetry: Any) -> _Result:
