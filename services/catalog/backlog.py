@@ -31,7 +31,7 @@ def of(tx: Session, mission_id: str, ttl_s: float, now: float | None = None) -> 
     by_state = select(Frame.state, func.count()).where(
         Frame.mission_id == mission_id, Frame.state.in_(("received", "ready", "matched"))
     )
-    frames = dict(tx.execute(by_state.group_by(Frame.state)).tuples().all())
+    frames = {row[0]: row[1] for row in tx.execute(by_state.group_by(Frame.state))}
     to_do = _to_do()
     claimed = DirtyTile.claimed_at > clock(now) - ttl_s
     query = select(
