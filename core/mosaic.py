@@ -21,9 +21,10 @@ from core.geometry import Camera, Pose, PosedFrame, World
 from core.grid import TileKey
 from core.matching import PairMatch, match_pair
 from core.metadata import read_metadata
-from core.neighbours import Sighting, candidates
+from core.neighbours import Pair, Sighting
 from core.photo import probe
 from core.pose_graph import GraphFrame, Solution, solve
+from core.submaps import Canonical, SubmapGraph, canonical, submap_graph
 
 FEATURE_SIDE_PX = FeatureParams().side_px
 """Keypoints are found on a copy of this size, so nothing larger is decoded for them."""
@@ -59,6 +60,7 @@ class Mosaic:
     layout: Layout
     tiles: Mapping[TileKey, bytes]
     rejected: Mapping[str, str]
+    submaps: SubmapGraph
 
 
 def frame_id_of(data: bytes) -> str:
@@ -154,14 +156,25 @@ def build(photos: Sequence[tuple[str, bytes]], max_side: int | None = None, mode
             rejected[frame_id] = error.code
         else:
             read[frame_id] = _Read(GraphFrame(frame_id, name, meta), features, data)
-    matches = [_matched(read[a], read[b]) for a, b in candidates([r.sighting for r in read.values()])]
-    if mode == "gnss":
-        matches = []
-    solution = solve([r.frame for r in read.values()], [m for m in matches if m.accepted])
+    frames = [r.frame for r in read.values()]
+
+    def matched(pairs: Sequence[Pair]) -> list[PairMatch]:
+        return [m for a, b in pairs if (m := _matched(read[a], read[b])).accepted]
+
+    wanted = canonical([r.sighting for r in read.values()] if mode == "visual" else [], matched)
+    assert wanted is not None  # `matched` never puts off
+    solution, submaps = solved(frames, wanted)
     camera_keys = {k: r.frame.meta.camera_key for k, r in read.items()}
     layout = lay_out(solution, camera_keys, lambda k: read[k].features.thumb, max_side)
     tiles = draw(layout, _Photos(read, max_side))
-    return Mosaic(solution, layout, tiles, rejected | dict(layout.rejected))
+    return Mosaic(solution, layout, tiles, rejected | dict(layout.rejected), submaps)
+
+
+def solved(frames: Sequence[GraphFrame], pairs: Canonical) -> tuple[Solution, SubmapGraph]:
+    """The final poses, and which submaps they were made of; a function of the sets."""
+    solution = solve(frames, pairs.matches)
+    merged = {k: pose.submap for k, pose in solution.poses.items()}
+    return solution, submap_graph(frames, pairs.matches, merged, solution.dropped_pairs, pairs.extra)
 
 
 def draw(layout: Layout, photos: _Photos) -> dict[TileKey, bytes]:

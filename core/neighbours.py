@@ -111,7 +111,7 @@ def _in_space(
     located = [i for i, f in enumerate(ordered) if f.gps is not None]
     if len(located) < 2:
         return
-    xy, position_of = np.unique(_metres(ordered, located), axis=0, return_inverse=True)
+    xy, position_of = np.unique(metres(ordered, located), axis=0, return_inverse=True)
     position_of = position_of.ravel()
     at: list[list[int]] = [[] for _ in xy]
     for i, p in zip(located, position_of, strict=True):
@@ -125,8 +125,11 @@ def _in_space(
             yield i, _one_each(i, at, _spread(xy, int(p), np.atleast_1d(near), params))
 
 
-def _metres(ordered: Sequence[Sighting], located: Sequence[int]) -> Floats:
-    """Rounded to centimetres: a repeated fix is one position. The scale of longitude may be rough here."""
+def metres(ordered: Sequence[Sighting], located: Sequence[int]) -> Floats:
+    """East and north (N, 2) of frames that have GPS, from a middle of theirs; longitude's scale may be rough.
+
+    Rounded to centimetres: a repeated fix is one position.
+    """
     fixes = [ordered[i].gps for i in located]
     lat_lon = np.array([(g.lat_deg, g.lon_deg) for g in fixes if g is not None])
     lon = lat_lon[:, 1] - np.median(lat_lon[:, 1])
@@ -157,7 +160,7 @@ def _in_appearance(
 ) -> Iterable[tuple[int, list[int]]]:
     if len(ordered) < 2:
         return
-    words = _peculiar(np.stack([f.words for f in ordered]))
+    words = peculiar(np.stack([f.words for f in ordered]))
     for block in (of[k : k + 256] for k in range(0, len(of), 256)):
         # Rounded, so that the last bits of a product do not decide between twins: the earlier one wins.
         similarity = np.round(words[block] @ words.T / _SIMILARITY_STEP)
@@ -175,7 +178,7 @@ def _highest(row: NDArray[np.float32], count: int) -> list[int]:
     return [int(j) for j in enough[np.argsort(-row[enough], kind="stable")][:count]]
 
 
-def _peculiar(words: NDArray[np.float32]) -> NDArray[np.float32]:
+def peculiar(words: NDArray[np.float32]) -> NDArray[np.float32]:
     """What sets each picture of the mission apart from the mission's average: (N, W), rows of length 1.
 
     One field fills all pictures of many a flight; without this, its common look drowns the differences.
