@@ -1,15 +1,15 @@
-"""Levenberg-Marquardt on the planar-restricted pose graph; gtsam eliminates, this decides the steps."""
+"""Levenberg-Marquardt on the planar-restricted pose graph."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from core.geometry import Array
-from core.pose_graph.elimination import Border, solve_blocks
+from core.pose_graph.elimination import Front, plan
+from core.pose_graph.factor import Border, solve_blocks
 from core.pose_graph.priors import Priors, add_priors
 from core.pose_graph.residuals import Edges, Normal, State, linearise, retract
 
@@ -54,15 +54,15 @@ def adjust(
     """
     state, damping = start, 1e-4
     normal = normal_equations(edges, priors, state, sigma_px, scale)
-    ordering: gtsam.Ordering | None = None
+    fronts = plan(len(start.R), edges.pairs)
     done = 1
     while done < steps:
-        solved = _step(edges, normal, damping, held, ordering)
+        solved = _step(fronts, edges, normal, damping, held)
         if solved is None:
             damping = max(damping * 10, 1e-4)
             done += 1
             continue
-        frames, border, ordering = solved
+        frames, border = solved
         trial = retract(state, frames, border)
         tried = normal_equations(edges, priors, trial, sigma_px, scale)
         done += 1
@@ -80,12 +80,8 @@ def adjust(
 
 
 def _step(
-    edges: Edges,
-    normal: Normal,
-    damping: float,
-    held: NDArray[np.bool_] | None,
-    ordering: gtsam.Ordering | None,
-) -> tuple[Array, Array, gtsam.Ordering] | None:
+    fronts: tuple[Front, ...], edges: Edges, normal: Normal, damping: float, held: NDArray[np.bool_] | None
+) -> tuple[Array, Array] | None:
     diagonal = np.arange(normal.frame.shape[1])
     frame, pair, cross, rhs = normal.frame.copy(), normal.pair, normal.cross, normal.frame_rhs
     frame[:, diagonal, diagonal] *= 1 + damping
@@ -96,4 +92,4 @@ def _step(
         rhs, cross = np.where(held[:, None], 0.0, rhs), np.where(held[:, None, None], 0.0, cross)
         still = held[edges.pairs[:, 0]] | held[edges.pairs[:, 1]]
         pair = np.where(still[:, None, None], 0.0, pair)
-    return solve_blocks(frame, edges.pairs, pair, rhs, Border(cross, border, normal.border_rhs), ordering)
+    return solve_blocks(fronts, frame, pair, rhs, Border(cross, border, normal.border_rhs))

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from core.geometry import Array
-from core.pose_graph.elimination import solve_blocks
+from core.pose_graph.elimination import plan
+from core.pose_graph.factor import solve_blocks
 from core.pose_graph.residuals import IntArray
 
 ComplexArray = NDArray[np.complex128]
@@ -95,7 +95,7 @@ def average(
     edge_weight, gps_weight = np.ones(len(pairs)), np.ones(n)
     height = np.full(n, height_m)
     x, error = np.zeros((n, 4)), np.zeros(len(pairs))
-    ordering: gtsam.Ordering | None = None
+    fronts = plan(n, pairs)
     for turn in range(ROUNDS):
         w = edge_weight * POINTS_WORTH / (MODEL_ERROR * np.sqrt(height[i] * height[j])) ** 2
         H, g = np.zeros((n, 4, 4)), np.zeros((n, 4))
@@ -108,10 +108,10 @@ def average(
         H[roots] += np.eye(4) * 1e3
         g[roots, 0] += 1e3 * height_m
         H += np.eye(4) * 1e-9
-        solved = solve_blocks(H, pairs, -w[:, None, None] * m.mixed, g, None, ordering)
+        solved = solve_blocks(fronts, H, -w[:, None, None] * m.mixed, g)
         if solved is None:
             break
-        x, _, ordering = solved
+        x, _ = solved
         before = error
         z = x[:, 0] + 1j * x[:, 1]
         # a frame whose pairs were all turned down tends to z = 0: never let that raise the pairs' weight
