@@ -233,3 +233,14 @@ class Export(Base):
     requested_at: Mapped[float]
     finished_at: Mapped[float | None]
     woken_at: Mapped[float | None]
+
+
+class Survey(Base):
+    """The mission's surveyed points as they were sent; `content` None: they were taken back."""
+
+    __tablename__ = "surveys"
+
+    mission_id: Mapped[str] = _mission_key()
+    content: Mapped[str | None]
+    used: Mapped[list[str]] = mapped_column(JSON(none_as_null=True))  # points that hold the map in place
+    changed_at: Mapped[float]

@@ -27,6 +27,7 @@ from services.catalog.poses import Poses
 from services.export_names import crs_of
 from services.report import report
 from services.tables import Export, Mission
+from workers import surveyed
 from workers.app import Stopwatch, db, log, settings, stage, store
 from workers.photos import MissionPhotos, shelf
 
@@ -138,7 +139,12 @@ def _route(path: Path, mission: Mission, _wanted: Export) -> None:
 
 def _report(path: Path, mission: Mission, _wanted: Export) -> None:
     with db.read() as tx:
-        path.write_bytes(json_bytes(report(tx, mission.id)))
+        document = report(tx, mission.id)
+    points = surveyed.points_of(mission.id)
+    if points is not None:
+        placed = _placed(mission) if mission.world else (None, [])
+        document["checkpoints"] = surveyed.measured(mission, points, *placed)
+    path.write_bytes(json_bytes(document))
 
 
 def _stac(path: Path, mission: Mission, _wanted: Export) -> None:

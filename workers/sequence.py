@@ -10,13 +10,13 @@ from core.matching import PairMatch
 from core.mosaic import lay_out
 from core.neighbours import Sighting, candidates
 from core.pose_graph import GraphFrame, Solution, place, solve
-from services.catalog import backlog, frames, missions, pairs, poses, tiles
+from services.catalog import backlog, frames, missions, pairs, poses, surveys, tiles
 from services.catalog.backlog import Backlog
 from services.catalog.pairs import Key as PairKey
 from services.catalog.tiles import Key as TileId
 from services.queue import send
 from services.tables import Mission
-from workers import warmup
+from workers import surveyed, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
 from workers.lease import held
 from workers.photos import Pixels, shelf
@@ -141,7 +141,8 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
 
 def _solve_all(mission: Mission, known: Known) -> Solution:
     matches = _matches(mission.id, None) if mission.mode == "visual" else []
-    return solve([known.seen[k] for k in sorted(known.seen)], matches)
+    solved = solve([known.seen[k] for k in sorted(known.seen)], matches)
+    return surveyed.held(solved, known.seen, surveyed.points_of(mission.id))
 
 
 def _matches(mission_id: str, touching: set[str] | None) -> list[PairMatch]:
@@ -172,7 +173,8 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
     if not _all_matched(mission.id, wanted):
         return False
     matches = [m for m in _matches(mission.id, None) if (m.low, m.high) in wanted]
-    solved = solve(list(graph.values()), matches)
+    points = surveyed.points_of(mission.id)
+    solved = surveyed.held(solve(list(graph.values()), matches), graph, points)
     keys = {k: f.meta.camera_key for k, f in graph.items()}
     layout = lay_out(solved, keys, _thumb(mission.id), mission.max_side)
     update = replace(
@@ -183,6 +185,8 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
         final=True,
     )
     with db.write() as tx:
+        if surveys.checkpoints(tx, mission.id) != points:
+            return True  # other points came meanwhile
         generation = poses.save(tx, mission.id, epoch, update)
         clock.spend(tx, mission.id, "solve")
     _known[mission.id] = Known(generation, layout, len(graph), solved.reprojection_rms_px, graph)

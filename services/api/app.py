@@ -12,7 +12,19 @@ from fastapi import APIRouter, FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from services import queue
-from services.api import events, exports, frames, health, missions, pages, problems, tiles, upload
+from services.api import (
+    events,
+    exports,
+    frames,
+    health,
+    missions,
+    pages,
+    problems,
+    submaps,
+    surveys,
+    tiles,
+    upload,
+)
 from services.api.context import ACCEPT_AT_ONCE, Send, Services
 from services.api.documents import progress_document
 from services.api.feed import Feed
@@ -44,7 +56,7 @@ def create_app(settings: Settings | None = None, send: Send | None = None) -> Fa
         openapi_url="/api/v1/openapi.json",
     )
     v1 = APIRouter(prefix="/api/v1", responses=_PROBLEM)
-    for part in (missions, upload, frames, tiles, events, exports):
+    for part in (missions, upload, frames, tiles, events, submaps, surveys, exports):
         v1.include_router(part.router)
     app.include_router(v1)
     app.include_router(health.router)

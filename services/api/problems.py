@@ -16,6 +16,7 @@ from sqlalchemy.exc import DBAPIError, OperationalError
 from starlette.exceptions import HTTPException
 
 from core.errors import (
+    BadCheckpoints,
     BadCrs,
     BadTelemetry,
     FileTooLarge,
@@ -90,6 +91,7 @@ STATUS: tuple[tuple[type[Exception], int], ...] = (
     (NotAnImage, 415),
     (RejectedFrame, 422),
     (BadTelemetry, 422),
+    (BadCheckpoints, 422),
     (BadCrs, 422),
     (NoPhotos, 422),
     (BadUpload, 400),

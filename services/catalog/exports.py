@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from services.catalog import events
 from services.catalog.rows import clock, lock
 from services.catalog.wakes import Wake
-from services.tables import Export, Frame, Mission
+from services.tables import Export, Frame, Mission, Survey
 
 
 def request(tx: Session, mission_id: str, name: str, now: float | None = None) -> tuple[Export, bool]:
@@ -95,6 +95,9 @@ def _is_good(tx: Session, mission: Mission, export: Export) -> bool:
         return False
     # The report tells of rejected photos and of the mission's end, which change no pose and no tile.
     if mission.finished_at is not None and mission.finished_at > export.requested_at:
+        return False
+    survey = tx.get(Survey, mission.id, populate_existing=True)
+    if export.name == "report.json" and survey is not None and survey.changed_at > export.requested_at:
         return False
     newest = tx.scalar(select(func.max(Frame.received_at)).where(Frame.mission_id == mission.id))
     return newest is None or newest <= export.requested_at

@@ -1,55 +1,82 @@
-"""`--gcp`: how far surveyed points lie off, measured in the files that came out; added to report.json."""
+"""`--gcp` and `--use-gcp`: surveyed points on their way to the mission, and what its report says of them."""
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from pyproj import Transformer
-
-from core.checkpoints import Checkpoints, checkpoint_errors, parse_gcp_list
+from core.checkpoints import Checkpoints, parse_gcp_list
 from core.errors import BadCheckpoints
-from core.geometry import Array, Camera, Pose, PosedFrame, World
+from services.cli.client import Client
 
 
-class _Plane(World):
-    """poses.json's own CRS taken for a world: its coordinates are used as they are written."""
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """A gcp_list.txt as it is sent, and the points that are to hold the map in place."""
 
-    to_crs: Transformer
-
-    def from_geodetic(self, lon_lat_alt: Array) -> Array:
-        """Longitude, latitude, height (N, 3) → the CRS's easting, northing, height (N, 3)."""
-        east, north = self.to_crs.transform(lon_lat_alt[:, 0], lon_lat_alt[:, 1])
-        return np.column_stack((east, north, lon_lat_alt[:, 2]))
+    content: str
+    use: tuple[str, ...]
 
 
-def read_gcp(path: Path) -> Checkpoints:
-    """The surveyed points of a gcp_list.txt. Raises BadCheckpoints with what is wrong."""
+def read_survey(path: Path | None, use: Sequence[str]) -> Survey | None:
+    """The surveyed points of a gcp_list.txt. `use`: names, several parted by commas in one.
+
+    Raises BadCheckpoints with what is wrong, before anything is uploaded.
+    """
+    if path is None:
+        if use:
+            raise BadCheckpoints("--use-gcp names points of a file: add --gcp gcp_list.txt.")
+        return None
     try:
-        return parse_gcp_list(path.read_text())
+        content = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise BadCheckpoints(f"The checkpoint file {path} cannot be read: {error}.") from error
+    points = parse_gcp_list(content)
+    return Survey(content, tuple(sorted(points.using(_names(points, use)).used)))
 
 
-def add_checkpoints(points: Checkpoints, photos: Path, out: Path) -> None:
-    """Writes the points' errors into the report."""
-    document = json.loads((out / "poses.json").read_text())
-    plane = _Plane(0.0, 0.0)
-    object.__setattr__(plane, "to_crs", Transformer.from_crs(4326, document["crs"], always_xy=True))
-    errors = checkpoint_errors(points, plane, _frames(document))
-    path = out / "report.json"
-    report = json.loads(path.read_text())
-    report["checkpoints"] = None if errors is None else errors.to_json()
-    path.write_text(json.dumps(report, indent=1))
+def _names(points: Checkpoints, use: Sequence[str]) -> list[str]:
+    """A point without a name is called after its place, which holds a comma itself."""
+    known = set(points.points)
+    return [n.strip() for text in use for n in ([text] if text in known else text.split(",")) if n.strip()]
 
 
-def _frames(document: dict[str, Any]) -> dict[str, PosedFrame]:
-    cameras = [Camera(**{k: v for k, v in c.items() if k != "model"}) for c in document["cameras"]]
-    return {f["name"]: PosedFrame(f["name"], cameras[f["camera"]], _pose(f)) for f in document["frames"]}
+def send_survey(client: Client, mission_id: str, survey: Survey | None) -> None:
+    """Makes the mission's surveyed points these."""
+    if survey is None:
+        client.survey(mission_id, None)
+    else:
+        client.survey(mission_id, survey.content, survey.use)
 
 
-def _pose(frame: dict[str, Any]) -> Pose:
-    center = np.array(frame["center"], float)
-    return Pose(np.array(frame["R"], float), center, frame["ground_height"], frame["source"])
+def checkpoint_rows(checked: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Lines of the summary: how far the points lie off, through the poses and in the mosaic."""
+    if not checked:
+        return []
+    rows = []
+    used = [p["point"] for p in checked["points"] if p["used"]]
+    if used:
+        rows.append(("held by", ", ".join(used)))
+    poses, mosaic = checked["poses"], checked["mosaic"]
+    if poses:
+        seen = f"{_points(poses['points'])} in {poses['sightings']} photos"
+        errors = _errors(poses["plane_raw_m"], poses["plane_debiased_m"], poses["plane_similarity_m"])
+        rows.append(("checkpoints, poses", f"{seen}: {errors}"))
+    if mosaic:
+        found = f"{mosaic['found']} of {_points(mosaic['points'])} found"
+        errors = _errors(mosaic["raw_m"], mosaic["debiased_m"], mosaic["similarity_m"])
+        rows.append(("checkpoints, mosaic", f"{found}: {errors}" if mosaic["found"] else found))
+    return rows or [("checkpoints", "none of them is seen in a posed photo")]
+
+
+def _points(number: int) -> str:
+    return f"{number} point" + "s" * (number != 1)
+
+
+def _errors(raw_m: float, debiased_m: float | None, similarity_m: float | None) -> str:
+    said = [f"{raw_m:.2f} m"]
+    said += [f"{debiased_m:.2f} m less the mean shift"] if debiased_m is not None else []
+    said += [f"{similarity_m:.2f} m after a similarity"] if similarity_m is not None else []
+    return ", ".join(said)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -103,6 +103,14 @@ class Client:
     def finalise(self, mission_id: str) -> None:
         """Asks for the final map."""
         self._json("POST", f"/missions/{mission_id}/finalise")
+
+    def survey(self, mission_id: str, content: str | None, use: Sequence[str] = ()) -> None:
+        """Sends the surveyed points (None: takes them back); those to `use` hold the map in place."""
+        url = f"/missions/{mission_id}/checkpoints"
+        if content is None:
+            self._good(self._ask("DELETE", url))
+        else:
+            self._json("PUT", url, content=content.encode(), params={"use": list(use)})
 
     def download(
         self, mission_id: str, name: str, path: Path, wait: Callable[[], None], crs: str | None = None

@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from services.cli.checkpoints import add_checkpoints, read_gcp
+from services.cli.checkpoints import checkpoint_rows, read_survey, send_survey
 from services.cli.client import Client
 from services.cli.flight import Photo, find_photos
 from services.cli.mapping import Screen, Tally, deliver, follow, upload_all
@@ -33,6 +33,12 @@ def run(
     ] = "visual",
     gcp: Annotated[
         Path | None, typer.Option(help="Surveyed points (ODM's gcp_list.txt) to check against.")
+    ] = None,
+    use_gcp: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME[,NAME…]", help="Points of --gcp that enter the solution; the rest checks it."
+        ),
     ] = None,
     max_side: Annotated[
         int | None, typer.Option(help="Longest side in pixels to work on; all unless set.")
@@ -53,14 +59,13 @@ def run(
         mosaic_in(crs)  # a wrong one shall not show after an hour's work
     console = Console(stderr=False)
     found = find_photos(photos)
-    points = read_gcp(gcp) if gcp else None
+    survey = read_survey(gcp, use_gcp or [])
     with stop_on_signals(), _service(server, out / HOME, console) as url:
         client = Client(url)
         try:
             mission_id = _mission(client, out / HOME, photos, mode, max_side)
+            send_survey(client, mission_id, survey)
             map_photos(client, mission_id, found, out, console, 1 / pace if pace else 0.0, crs)
-            if points:
-                add_checkpoints(points, photos, out)
             summary(out, console, f"{url}/missions/{mission_id}" if keep or server else None)
             if keep:
                 console.print(f"The map stays up at {url}/missions/{mission_id} until Ctrl-C.")
@@ -158,11 +163,7 @@ def summary(out: Path, console: Console, url: str | None) -> None:
         ("reprojection", _number(report.get("reprojection_rms_px"), "{:.2f} px")),
         ("tiles", str(report.get("tiles"))),
     ]
-    checked = report.get("checkpoints")
-    if checked:
-        rows.append(
-            ("checkpoints", f"{checked['points']} points, {checked['plane_similarity_m']:.2f} m (similarity)")
-        )
+    rows += checkpoint_rows(report.get("checkpoints"))
     for name, value in [*rows, ("map", str(out / "mosaic.tif")), *([("live map", url)] if url else [])]:
         table.add_row(name, value)
     console.print(table)

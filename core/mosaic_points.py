@@ -1,0 +1,260 @@
+"""Where the finished mosaic shows surveyed points: each marked photo is looked up in it by correlation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from core.checkpoints import CheckpointErrors, Checkpoints, Observation, PointError, rms_levels
+from core.geometry import Array, World
+from core.grid import UtmGrid
+
+Gray = NDArray[np.float32]
+Outcome = Literal["found", "outside", "flat", "poor", "ambiguous"]
+Picture = Callable[[UtmGrid], NDArray[np.uint8]]
+"""What the mosaic shows in a window of its grid: RGBA (height, width, 4) uint8."""
+PhotoOf = Callable[[str], NDArray[np.uint8]]
+"""A frame's photo by its id, RGB (h, w, 3) uint8, of any size."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchParams:
+    """How a marked point is looked for.
+
+    `radius_m`: around where its own photo's pose puts it, `max_radius_px` at most; `half_px`: of the patch,
+    in pixels of the mosaic. Not found are patches that correlate less than `min_score`, that have another
+    peak less than `margin` below the best, or less contrast than `min_contrast` grey levels.
+    """
+
+    radius_m: float = 4.0
+    max_radius_px: int = 200
+    half_px: int = 20
+    min_score: float = 0.6
+    margin: float = 0.05
+    min_contrast: float = 2.0
+
+
+DEFAULT = SearchParams()
+
+
+@dataclass(frozen=True, slots=True)
+class Lookup:
+    """One marked pixel looked up. `place`: (2,) in the mosaic's CRS where found; `score`: its correlation."""
+
+    point: str
+    outcome: Outcome
+    score: float = 0.0
+    place: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MosaicPoint:
+    """One point as the mosaic shows it: the median of where its photos were found, metres off the survey.
+
+    `found` of `sightings` photos; `spread_m`: how far these lie from their median, RMS; `why`: what became
+    of the others, or of all. Errors are None when no photo was found.
+    """
+
+    point: str
+    sightings: int
+    found: int
+    east_m: float | None
+    north_m: float | None
+    spread_m: float | None
+    score: float | None
+    why: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class MosaicErrors:
+    """Horizontal RMS errors over the points that check and were found, metres; see CheckpointErrors."""
+
+    points: int
+    found: int
+    raw_m: float | None
+    debiased_m: float | None
+    similarity_m: float | None
+
+
+def look_up(
+    seen: Sequence[Observation],
+    world: World,
+    grid: UtmGrid,
+    picture: Picture,
+    photo: PhotoOf,
+    params: SearchParams = DEFAULT,
+) -> list[Lookup]:
+    """Look for every marked pixel in the mosaic, in the order of `seen`. `grid`: of the whole mosaic.
+
+    A patch of the photo around the pixel is drawn onto the mosaic's grid with the photo's pose, and moved to
+    where it correlates best, to a fraction of a pixel.
+    """
+    return [_look_up(o, world, grid, picture, photo(o.frame.frame_id), params) for o in seen]
+
+
+def _look_up(
+    o: Observation, world: World, grid: UtmGrid, picture: Picture, photo: NDArray[np.uint8], p: SearchParams
+) -> Lookup:
+    name = o.sighting.point
+    cols, rows = grid.from_world(world, o.plane[None], o.frame.pose.ground_h_m)
+    at = np.array([cols[0], rows[0]])
+    middle = np.rint(at).astype(int)
+    reach = min(p.max_radius_px, max(4, round(p.radius_m / grid.gsd_m)))
+    patch, inside = _patch(o, world, grid, photo, middle, p.half_px)
+    if inside[p.half_px, p.half_px] == 0 or inside.mean() < 0.5:
+        return Lookup(name, "outside")
+    if float(patch[inside > 0].std()) < p.min_contrast:
+        return Lookup(name, "flat")
+    side = reach + p.half_px
+    window = picture(grid.window(int(middle[0]) - side, int(middle[1]) - side, 2 * side + 1, 2 * side + 1))
+    scores = _scores(window, patch, inside)
+    if scores is None:
+        return Lookup(name, "outside")
+    best, place = _peak(scores)
+    if best < p.min_score or place is None:
+        return Lookup(name, "poor", best)
+    if _runner_up(scores, p.half_px // 2) > best - p.margin:
+        return Lookup(name, "ambiguous", best)
+    col, row = at + place - reach
+    crs_xy = np.array([grid.left + (col + 0.5) * grid.gsd_m, grid.top - (row + 0.5) * grid.gsd_m])
+    return Lookup(name, "found", best, crs_xy)
+
+
+def _patch(
+    o: Observation, world: World, grid: UtmGrid, photo: NDArray[np.uint8], middle: NDArray[np.int_], half: int
+) -> tuple[Gray, Gray]:
+    """The photo around the pixel as the mosaic would draw it, grey, and 1 where the photo reaches."""
+    cols, rows = np.meshgrid(*(m + np.arange(-half, half + 1) for m in middle))
+    pose, camera = o.frame.pose, o.frame.camera.scaled(photo.shape[1], photo.shape[0])
+    xy = grid.to_world(world, cols.ravel(), rows.ravel(), pose.ground_h_m)
+    uv = pose.pixels(camera, np.column_stack((xy, np.full(len(xy), pose.ground_h_m))))
+    low, high = np.floor(uv.min(0)).astype(int) - 2, np.ceil(uv.max(0)).astype(int) + 3
+    low, high = np.clip(low, 0, None), np.clip(high, 1, (camera.width, camera.height))
+    if (high - low < 2).any():
+        return np.zeros(cols.shape, np.float32), np.zeros(cols.shape, np.float32)
+    cut = cv2.cvtColor(np.ascontiguousarray(photo[low[1] : high[1], low[0] : high[0]]), cv2.COLOR_RGB2GRAY)
+    u, v = (uv - low).astype(np.float32).T.reshape(2, *cols.shape)
+    grey = cv2.remap(
+        cut.astype(np.float32), u, v, cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    edge = np.array([camera.width - 1, camera.height - 1])
+    inside = ((uv >= 0) & (uv <= edge)).all(1).reshape(cols.shape)
+    return np.asarray(grey, np.float32), inside.astype(np.float32)
+
+
+def _scores(window: NDArray[np.uint8], patch: Gray, inside: Gray) -> Gray | None:
+    """Correlation (2 reach + 1)², −1 where the mosaic ends under the patch; None where it does everywhere."""
+    shown = (window[:, :, 3] == 255).astype(np.float32)
+    grey = cv2.cvtColor(np.ascontiguousarray(window[:, :, :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    covered = cv2.matchTemplate(shown, inside, cv2.TM_CCORR) >= 0.95 * inside.sum()
+    if not covered.any():
+        return None
+    mask = None if inside.all() else inside
+    scores = cv2.matchTemplate(grey, patch, cv2.TM_CCOEFF_NORMED, mask=mask)
+    return np.where(covered & np.isfinite(scores), scores, np.float32(-1)).astype(np.float32)
+
+
+def _peak(scores: Gray) -> tuple[float, Array | None]:
+    """The best correlation and its place (column, row) by parabolas; None at the border of the search."""
+    row, col = (int(v) for v in np.unravel_index(int(scores.argmax()), scores.shape))
+    best = float(scores[row, col])
+    if not (0 < row < scores.shape[0] - 1 and 0 < col < scores.shape[1] - 1):
+        return best, None
+    across = _vertex(*(float(v) for v in scores[row, col - 1 : col + 2]))
+    down = _vertex(*(float(v) for v in scores[row - 1 : row + 2, col]))
+    return best, np.array([col + across, row + down])
+
+
+def _vertex(before: float, here: float, after: float) -> float:
+    bend = before - 2 * here + after
+    return 0.0 if bend >= 0 else min(max(0.5 * (before - after) / bend, -0.5), 0.5)
+
+
+def _runner_up(scores: Gray, apart_px: int) -> float:
+    """The highest local peak at least so far from the best one."""
+    peaks = np.where(scores >= cv2.dilate(scores, np.ones((3, 3), np.uint8)), scores, np.float32(-1))
+    row, col = (int(v) for v in np.unravel_index(int(scores.argmax()), scores.shape))
+    peaks[max(0, row - apart_px) : row + apart_px + 1, max(0, col - apart_px) : col + apart_px + 1] = -1
+    return float(peaks.max())
+
+
+def mosaic_points(checkpoints: Checkpoints, found: Sequence[Lookup], epsg: int) -> dict[str, MosaicPoint]:
+    """Every point that was looked for, by name. `epsg`: of the mosaic."""
+    truth = _truth(checkpoints, epsg)
+    groups: dict[str, list[Lookup]] = {}
+    for lookup in found:
+        groups.setdefault(lookup.point, []).append(lookup)
+    return {point: _point(point, groups[point], truth[point]) for point in sorted(groups)}
+
+
+def _truth(checkpoints: Checkpoints, epsg: int) -> dict[str, Array]:
+    to_crs = Transformer.from_crs(checkpoints.crs, epsg, always_xy=True)
+    xyz = np.array([s.xyz for s in checkpoints.sightings])
+    places = np.column_stack(to_crs.transform(xyz[:, 0], xyz[:, 1]))
+    return {s.point: place for s, place in zip(checkpoints.sightings, places, strict=True)}
+
+
+def _point(point: str, lookups: Sequence[Lookup], truth: Array) -> MosaicPoint:
+    why = {o: n for o in ("outside", "flat", "poor", "ambiguous") if (n := _count(lookups, o))}
+    places = np.array([k.place for k in lookups if k.place is not None])
+    if not len(places):
+        return MosaicPoint(point, len(lookups), 0, None, None, None, None, why)
+    shown = np.median(places, axis=0)
+    east_m, north_m = (round(float(v), 4) for v in shown - truth)
+    spread_m = round(float(np.sqrt(((places - shown) ** 2).sum(1).mean())), 4)
+    score = round(float(np.median([k.score for k in lookups if k.place is not None])), 3)
+    return MosaicPoint(point, len(lookups), len(places), east_m, north_m, spread_m, score, why)
+
+
+def _count(lookups: Sequence[Lookup], outcome: str) -> int:
+    return sum(lookup.outcome == outcome for lookup in lookups)
+
+
+def mosaic_errors(
+    checkpoints: Checkpoints, points: Mapping[str, MosaicPoint], epsg: int
+) -> MosaicErrors | None:
+    """The RMS over the points that check; None when none of them is seen in a posed photo."""
+    checks = [p for name, p in sorted(points.items()) if name not in checkpoints.used]
+    good = [p for p in checks if p.found]
+    if not good:
+        return MosaicErrors(len(checks), 0, None, None, None) if checks else None
+    truth = _truth(checkpoints, epsg)
+    errors = np.array([(p.east_m, p.north_m) for p in good], float)
+    levels = rms_levels(errors, np.array([truth[p.point] for p in good]), len(good))
+    return MosaicErrors(len(checks), len(good), *levels)
+
+
+def checkpoints_document(
+    checkpoints: Checkpoints,
+    poses: CheckpointErrors | None,
+    mosaic: MosaicErrors | None,
+    through_poses: Mapping[str, PointError],
+    in_mosaic: Mapping[str, MosaicPoint],
+) -> dict[str, Any]:
+    """What report.json says of the checkpoints: both summaries, and every point of the file."""
+
+    def entry(point: str) -> dict[str, Any]:
+        known, shown = through_poses.get(point), in_mosaic.get(point)
+        return {
+            "point": point,
+            "used": point in checkpoints.used,
+            "poses": None if known is None else _without_name(asdict(known)),
+            "mosaic": None if shown is None else _without_name(asdict(shown)),
+        }
+
+    return {
+        "poses": None if poses is None else asdict(poses),
+        "mosaic": None if mosaic is None else asdict(mosaic),
+        "points": [entry(point) for point in checkpoints.points],
+    }
+
+
+def _without_name(entry: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in entry.items() if k != "point"}

@@ -1,0 +1,69 @@
+"""A mission's surveyed points: the solution laid onto some of them, the finished map measured by the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.alignment import aligned
+from core.checkpoints import Checkpoints, by_name, checkpoint_errors, observations, point_errors
+from core.cog import DEFAULT as MOSAIC
+from core.cog import mosaic_grid
+from core.coverage import mission_gsd_m
+from core.exports import NamedFrame
+from core.fusion import FrameIndex, render
+from core.geometry import World
+from core.grid import UtmGrid
+from core.mosaic_points import checkpoints_document, look_up, mosaic_errors, mosaic_points
+from core.outline import ground_outline
+from core.pose_graph import GraphFrame, Solution
+from services.catalog import surveys
+from services.tables import Mission
+from workers.app import db
+from workers.photos import MissionPhotos, shelf
+
+
+def points_of(mission_id: str) -> Checkpoints | None:
+    """The mission's surveyed points."""
+    with db.read() as tx:
+        return surveys.checkpoints(tx, mission_id)
+
+
+def held(solution: Solution, graph: Mapping[str, GraphFrame], points: Checkpoints | None) -> Solution:
+    """The solution with the points that are used where the survey says."""
+    if points is None or not points.used:
+        return solution
+    names = {k: f.name for k, f in graph.items()}
+    return aligned(solution, names, {k: f.meta.camera_key for k, f in graph.items()}, points)
+
+
+def measured(
+    mission: Mission, points: Checkpoints, world: World | None, named: Sequence[NamedFrame]
+) -> dict[str, Any]:
+    """What the report says of the points.
+
+    Only the windows of the mosaic around them are drawn: pixel by pixel they are those of mosaic.tif.
+    """
+    frames = by_name((n.name, n.posed) for n in named)
+    seen = observations(points, world, frames) if world else []
+    gsd_m = mission_gsd_m((n.posed for n in named), mission.max_side)
+    if world is None or gsd_m is None or not seen:
+        return checkpoints_document(points, None, None, {}, {})
+    grid = mosaic_grid(world, [n.posed for n in named], gsd_m, MOSAIC.max_pixels)
+    photos = MissionPhotos(shelf, mission.id, mission.max_side)
+    index = FrameIndex(n.posed for n in named if ground_outline(n.posed) is not None)
+
+    def picture(window: UtmGrid) -> NDArray[np.uint8]:
+        return render(window, world, index.overlapping(window, world), photos)
+
+    shown = mosaic_points(points, look_up(seen, world, grid, picture, photos.photo), grid.epsg)
+    return checkpoints_document(
+        points,
+        checkpoint_errors(points, world, frames),
+        mosaic_errors(points, shown, grid.epsg),
+        point_errors(seen),
+        shown,
+    )
