@@ -48,6 +48,7 @@ class Mission(Base):
     world: Mapped[Json | None]  # lat_deg, lon_deg, alt_m
     zoom: Mapped[int | None]  # of the native tiles
     cameras: Mapped[Json] = mapped_column(default=dict)  # camera_key → fields of core.geometry.Camera
+    submaps: Mapped[Json | None]  # core.submaps.SubmapGraph.to_json() of the last solve
     revision: Mapped[int] = mapped_column(default=0)  # last published
     generation: Mapped[int] = mapped_column(default=0)  # last saved poses
     event_seq: Mapped[int] = mapped_column(default=0)

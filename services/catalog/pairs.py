@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import func, or_, select
+from sqlalchemy import func, or_, select, tuple_
 from sqlalchemy.orm import Session
 
 from services.catalog.rows import chunks, insert, lock
@@ -36,6 +36,19 @@ class PairSummary:
     done: int
     accepted: int
     reasons: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class PairVerdict:
+    """One pair as it is shown; `done`: it was matched, else somebody is at it."""
+
+    low: str
+    high: str
+    done: bool
+    accepted: bool
+    reason: str | None
+    inliers: int
+    counts: Mapping[str, int]
 
 
 def claim(tx: Session, mission_id: str, proposer: str | None, pairs: Iterable[Key]) -> Sequence[Key]:
@@ -115,6 +128,30 @@ def accepted(tx: Session, mission_id: str, touching: Collection[str] | None = No
     for some in chunks(sorted(touching)):
         found |= dict(_accepted_rows(tx, mission_id, some))
     return [found[key] for key in sorted(found)]
+
+
+def list(
+    tx: Session,
+    mission_id: str,
+    limit: int,
+    after: Key | None = None,
+    frame_id: str | None = None,
+    accepted: bool | None = None,
+) -> Sequence[PairVerdict]:
+    """Pairs by (low, high), from the one after `after` on; only a frame's, only those (not) accepted."""
+    columns = (Pair.low, Pair.high, Pair.state, Pair.accepted, Pair.reason, Pair.inliers, Pair.counts)
+    query = select(*columns).where(Pair.mission_id == mission_id)
+    if after is not None:
+        query = query.where(tuple_(Pair.low, Pair.high) > tuple_(*after))
+    if frame_id is not None:
+        query = query.where(or_(Pair.low == frame_id, Pair.high == frame_id))
+    if accepted is not None:
+        query = query.where(Pair.accepted.is_(accepted))
+    rows = tx.execute(query.order_by(Pair.low, Pair.high).limit(limit))
+    return [
+        PairVerdict(low, high, state == "done", good, reason, inliers, counts or {})
+        for low, high, state, good, reason, inliers, counts in rows
+    ]
 
 
 def summary(tx: Session, mission_id: str) -> PairSummary:

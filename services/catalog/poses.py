@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from sqlalchemy import delete, select
+from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
 from core.geometry import Camera, Pose, PosedFrame, World
@@ -42,7 +42,8 @@ class PoseUpdate:
 
     `placed`: new and moved frames, unchanged ones are welcome. `unplaced`: frame_id → (code, sentence).
     `dirty`: native tile → priority (0 first), all that now look different. `cameras`: refined, by key.
-    `solved_frames`: frames in the global solve, when this was one. `final`: it was the canonical one.
+    `solved_frames`: frames in the global solve, when this was one; `submaps`: what it was made of. `final`:
+    it was the canonical one.
     """
 
     placed: Sequence[Placed] = ()
@@ -53,6 +54,7 @@ class PoseUpdate:
     zoom: int | None = None
     solved_frames: int | None = None
     reprojection_rms_px: float | None = None
+    submaps: Mapping[str, Any] | None = None
     final: bool = False
 
 
@@ -112,6 +114,20 @@ def load(tx: Session, mission_id: str, box: TileBox | None = None) -> Poses:
     )
 
 
+def maps(tx: Session, mission_id: str) -> Mapping[int, Mapping[str, int]]:
+    """Each connected map's frames as of now, counted by the source of their poses."""
+    query = (
+        select(FramePose.submap, FramePose.source, func.count())
+        .where(FramePose.mission_id == mission_id)
+        .group_by(FramePose.submap, FramePose.source)
+        .order_by(FramePose.submap, FramePose.source)
+    )
+    found: dict[int, dict[str, int]] = {}
+    for submap, source, count in tx.execute(query):
+        found.setdefault(submap, {})[source] = count
+    return found
+
+
 def _save_mission(row: Mission, change: PoseUpdate) -> None:
     if change.world is not None:
         row.world = {k: float(v) for k, v in asdict(change.world).items()}
@@ -123,6 +139,8 @@ def _save_mission(row: Mission, change: PoseUpdate) -> None:
         row.solved_frames = change.solved_frames
     if change.reprojection_rms_px is not None:
         row.reprojection_rms_px = float(change.reprojection_rms_px)
+    if change.submaps is not None:
+        row.submaps = dict(change.submaps)
     if change.final:
         row.final_generation = row.generation
 
