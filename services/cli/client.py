@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,10 +12,15 @@ from typing import Any
 import httpx
 
 from core.errors import OrthostreamError
+from services.errors import OutOfDisk
 
 RETRY_S = 300.0
+GREETING_S = 10.0
+FULL_DISK_S = 10.0
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.3, 10.0
 _AGAIN = (408, 425, 429, 500, 502, 503, 504, 507)
+_FULL_DISK = 507
+_SAY_EVERY_S = 30.0
 
 
 class ServerAway(OrthostreamError):
@@ -43,20 +49,37 @@ class Uploaded:
 class Client:
     """One server's API v1. Safe to share between threads."""
 
-    def __init__(self, url: str, retry_s: float = RETRY_S) -> None:
-        """`url`: of the server, without a path. `retry_s`: for how long a call tries before it gives up."""
-        self.url = url.rstrip("/")
+    def __init__(
+        self, url: str, retry_s: float = RETRY_S, say: Callable[[str], None] = lambda line: None
+    ) -> None:
+        """`url`: of the server, without a path. `retry_s`: for how long a call tries before it gives up.
+
+        `say`: told, now and then, that the server cannot be reached and what is done about it. Raises
+        ServerAway when `url` cannot be one.
+        """
+        self.url = url.rstrip("/") if "://" in url else f"http://{url.rstrip('/')}"
         self._retry_s = retry_s
-        self._http = httpx.Client(
-            base_url=f"{self.url}/api/v1",
-            timeout=httpx.Timeout(60.0, connect=10.0, pool=None),
-            limits=httpx.Limits(max_connections=16, max_keepalive_connections=16),
-            trust_env=not self.url.startswith(("http://127.0.0.1", "http://localhost", "http://[::1]")),
-        )
+        self._say, self._said_at = say, -math.inf
+        local = self.url.startswith(("http://127.0.0.1", "http://localhost", "http://[::1]"))
+        try:
+            self._http = httpx.Client(
+                base_url=f"{self.url}/api/v1",
+                timeout=httpx.Timeout(60.0, connect=10.0, pool=None),
+                limits=httpx.Limits(max_connections=16, max_keepalive_connections=16),
+                trust_env=not local,
+            )
+        except httpx.InvalidURL as error:
+            raise ServerAway(f"{self.url!r} is not the address of a server ({error}).") from error
 
     def close(self) -> None:
         """Drops the connections."""
         self._http.close()
+
+    def greet(self) -> None:
+        """Raises ServerAway soon when nobody is there, and Refused when somebody else is."""
+        answer = self._stubbornly(lambda: self._http.get(f"{self.url}/health"), GREETING_S)
+        if _problem(answer) != {"status": "ok"}:
+            raise Refused(f"What answers at {self.url} is not orthostream. Is the address right?")
 
     def create(self, name: str, mode: str, max_side: int | None) -> str:
         """A new mission's id."""
@@ -86,7 +109,10 @@ class Client:
                 return found
 
     def upload(self, mission_id: str, name: str, data: bytes, telemetry: str | None = None) -> Uploaded:
-        """Sends one photo, again and again until the service has said what it thinks of it."""
+        """Sends one photo, again and again until the service has said what it thinks of it.
+
+        Raises OutOfDisk, Refused, ServerAway.
+        """
         fields = {"telemetry": telemetry} if telemetry else None
         answer = self._ask(
             "POST", f"/missions/{mission_id}/frames", files={"files": (name, data)}, data=fields
@@ -95,6 +121,8 @@ class Client:
             said = answer.json()["frames"][0]
         else:
             problem = _problem(answer)
+            if answer.status_code == _FULL_DISK:  # no photo's fault: it has to come again
+                raise OutOfDisk(problem.get("detail"))
             said = next(iter(problem.get("errors") or []), None)
             if said is None or "state" not in said:
                 raise Refused(str(problem.get("detail") or f"The server answered {answer.status_code}."))
@@ -129,14 +157,18 @@ class Client:
             wait()
             time.sleep(0.25)
         part = path.with_name(path.name + ".part")
-        self._stubbornly(lambda: self._stream(url, part))
+        self._good(self._stubbornly(lambda: self._stream(url, part)))
         part.replace(path)
         return True
 
     def _stream(self, url: str, path: Path) -> httpx.Response:
-        with self._http.stream("GET", url) as answer, path.open("wb") as out:
-            for chunk in answer.iter_bytes(1 << 20):
-                out.write(chunk)
+        with self._http.stream("GET", url) as answer:
+            if answer.is_success:
+                with path.open("wb") as out:
+                    for chunk in answer.iter_bytes(1 << 20):
+                        out.write(chunk)
+            else:
+                answer.read()
         return answer
 
     def _json(self, method: str, url: str, **more: Any) -> dict[str, Any]:
@@ -152,19 +184,31 @@ class Client:
     def _ask(self, method: str, url: str, **more: Any) -> httpx.Response:
         return self._stubbornly(lambda: self._http.request(method, url, **more))
 
-    def _stubbornly(self, ask: Callable[[], httpx.Response]) -> httpx.Response:
+    def _stubbornly(self, ask: Callable[[], httpx.Response], retry_s: float | None = None) -> httpx.Response:
         """A network that breaks and a server that restarts are normal: only time makes us give up."""
-        give_up_at, pause_s = time.monotonic() + self._retry_s, _FIRST_PAUSE_S
+        began, pause_s = time.monotonic(), _FIRST_PAUSE_S
         while True:
+            give_up_at = began + (self._retry_s if retry_s is None else retry_s)
             try:
                 answer = ask()
+                if answer.status_code == _FULL_DISK:
+                    give_up_at = min(give_up_at, began + FULL_DISK_S)
                 if answer.status_code not in _AGAIN or time.monotonic() + pause_s > give_up_at:
                     return answer
+                trouble = str(_problem(answer).get("detail") or f"it answers {answer.status_code}")
             except httpx.TransportError as error:
                 if time.monotonic() + pause_s > give_up_at:
                     raise ServerAway(f"The server {self.url} does not answer ({error}).") from error
+                trouble = str(error)
+            self._complain(trouble, give_up_at)
             time.sleep(pause_s)
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+    def _complain(self, trouble: str, give_up_at: float) -> None:
+        now = time.monotonic()
+        if now > self._said_at + _SAY_EVERY_S:
+            self._said_at = now
+            self._say(f"{self.url}: {trouble.rstrip('.')}. Trying again for {give_up_at - now:.0f} s more …")
 
 
 def _problem(answer: httpx.Response) -> Mapping[str, Any]:

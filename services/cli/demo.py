@@ -19,8 +19,9 @@ from rich.console import Console
 from core.errors import OrthostreamError
 from services.cli.client import Client
 from services.cli.mapping import Screen, Tally, deliver, follow
-from services.cli.run import HOME, stop_on_signals, summary
+from services.cli.run import HOME, make_writable, stop_on_signals
 from services.cli.serve import embedded_stack
+from services.cli.summary import summary
 from services.processes import die_with
 
 DRONES = 3
@@ -40,6 +41,7 @@ def demo(
 ) -> None:
     """Watch three simulated drones make a map: open the printed address in a browser."""
     console = Console()
+    make_writable(out / HOME)
     with stop_on_signals(), embedded_stack((out / HOME).absolute(), console.print) as url:
         client = Client(url)
         try:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
+from collections import Counter
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -11,8 +13,23 @@ from pathlib import Path
 from PIL import Image
 
 from core.errors import OrthostreamError
+from services.export_names import NAMES
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".mpo", ".tif", ".tiff")
+OTHER_PICTURES = (
+    ".png",
+    ".dng",
+    ".heic",
+    ".heif",
+    ".webp",
+    ".bmp",
+    ".gif",
+    ".jp2",
+    ".arw",
+    ".cr2",
+    ".nef",
+    ".raw",
+)
 _EXIF_IFD, _DATE_ORIGINAL, _SUBSEC_ORIGINAL, _DATE_TIME = 0x8769, 0x9003, 0x9291, 0x0132
 
 
@@ -31,29 +48,45 @@ class Photo:
     captured_s: float
 
 
-def find_photos(folder: Path) -> list[Photo]:
-    """All JPEG and TIFF files below `folder`, in capture order. Raises NoPhotos with what to do."""
+def find_photos(folder: Path, out: Path | None = None) -> list[Photo]:
+    """All JPEG and TIFF files below `folder`, in capture order. Raises NoPhotos with what to do.
+
+    `out`: where the results of the run before lie; they are no photos.
+    """
     if not folder.exists():
         raise NoPhotos(f"There is no folder {folder}. Name the one that holds the drone's photos.")
     if not folder.is_dir():
         raise NoPhotos(f"{folder} is not a folder. Name the folder that holds the drone's photos.")
-    paths = sorted(p for p in folder.rglob("*") if _is_photo(p, folder))
+    paths = sorted(p for p in folder.rglob("*") if _is_photo(p, folder, SUFFIXES) and not _result(p, out))
     if not paths:
         raise NoPhotos(
             f"No photos in {folder}: nothing in it ends in {', '.join(SUFFIXES)}. "
             "Copy the JPEG or TIFF files from the drone's card and name their folder."
         )
-    names = [p.name for p in paths]
-    photos = [
-        Photo(p, p.name if names.count(p.name) == 1 else p.relative_to(folder).as_posix(), captured_s(p))
-        for p in paths
-    ]
+    known = Counter(p.name for p in paths)
+    photos = [Photo(p, _name(p, folder, known[p.name] > 1), captured_s(p)) for p in paths]
     return sorted(photos, key=lambda p: (p.captured_s, p.name))
 
 
-def _is_photo(path: Path, folder: Path) -> bool:
+def left_out(folder: Path) -> list[Path]:
+    """Pictures below `folder` that are of no kind that can be mapped, sorted."""
+    return sorted(p for p in folder.rglob("*") if _is_photo(p, folder, OTHER_PICTURES))
+
+
+def _is_photo(path: Path, folder: Path, suffixes: tuple[str, ...]) -> bool:
     hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-    return not hidden and path.suffix.lower() in SUFFIXES and path.is_file()
+    return not hidden and path.suffix.lower() in suffixes and path.is_file()
+
+
+def _result(path: Path, out: Path | None) -> bool:
+    return out is not None and path.name in NAMES and path.parent.resolve() == out.resolve()
+
+
+def _name(path: Path, folder: Path, ambiguous: bool) -> str:
+    """The file's name, with its folders' where another has the same; bytes that are no text become �."""
+    # Joined by "_": a photo's name holds no folders on the server, whoever sends it.
+    name = "_".join(path.relative_to(folder).parts) if ambiguous else path.name
+    return os.fsencode(name).decode("utf-8", "replace")
 
 
 def captured_s(path: Path) -> float:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,6 +22,8 @@ PARALLEL = 4
 POLL_S = 0.25
 STUCK_S = 900.0
 SHOWN = 20
+LOOK_AROUND_S = 10.0
+NO_PHOTO_BYTES = 1_000_000_000
 
 
 class StandsStill(OrthostreamError):
@@ -32,12 +34,19 @@ class StandsStill(OrthostreamError):
 
 @dataclass
 class Tally:
-    """What became of the photos on their way up. `refused`: name → why."""
+    """What became of the photos on their way up.
+
+    `refused`: name → why, `unread`: those of them that never reached the server, `copies`: name → the photo
+    that has the same bytes.
+    """
 
     sent: int = 0
     known: int = 0
     refused: dict[str, str] = field(default_factory=dict)
+    unread: dict[str, str] = field(default_factory=dict)
+    copies: dict[str, str] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
+    _first: dict[str, str] = field(default_factory=dict)
 
     def add(self, said: Uploaded) -> None:
         """Counts one photo."""
@@ -46,6 +55,16 @@ class Tally:
             self.known += not said.created
             if said.state == "rejected":
                 self.refused[said.name] = said.detail or "refused"
+            if said.frame_id is None:
+                self.unread[said.name] = said.detail or "unreadable"
+
+    def is_copy(self, name: str, frame_id: str) -> bool:
+        """Whether another photo brought the same bytes; the first one who asks is the original."""
+        with self.lock:
+            original = self._first.setdefault(frame_id, name)
+            if original != name:
+                self.copies[name] = original
+            return original != name
 
 
 class Screen:
@@ -88,35 +107,63 @@ class Screen:
 def upload_all(
     client: Client, mission_id: str, photos: Sequence[Photo], tally: Tally, pace_s: float = 0.0
 ) -> None:
-    """Sends the photos in their order, several at a time; `pace_s`: seconds from one to the next."""
+    """Sends the photos in their order, several at a time; `pace_s`: seconds from one to the next.
+
+    Raises what an upload raises, as soon as the others that are under way have ended.
+    """
     there = {f["frame_id"] for f in client.frames(mission_id) if f["state"] != "rejected"}
     started = time.monotonic()
+    waiting = iter(enumerate(photos))
+    turn, over = threading.Lock(), threading.Event()
 
-    def send(numbered: tuple[int, Photo]) -> None:
-        number, photo = numbered
-        delay = started + number * pace_s - time.monotonic()
-        if delay > 0:
-            time.sleep(delay)
-        data = photo.path.read_bytes()
-        frame_id = identify(data)
-        if frame_id in there:
-            tally.add(Uploaded(photo.name, frame_id, "received", created=False))
-        else:
-            tally.add(client.upload(mission_id, photo.name, data))
+    def send() -> None:
+        while not over.is_set():
+            with turn:  # one by one: which of two copies is the original must not depend on luck
+                number, photo = next(waiting, (0, None))
+                if photo is None:
+                    return
+                time.sleep(max(0.0, started + number * pace_s - time.monotonic()))
+                data = _to_send(photo, there, tally)
+            if data is not None:
+                tally.add(client.upload(mission_id, photo.name, data))
 
     with ThreadPoolExecutor(PARALLEL, thread_name_prefix="upload") as pool:
         try:
-            for _ in pool.map(send, enumerate(photos)):
-                pass
-        except BaseException:
-            pool.shutdown(cancel_futures=True, wait=False)
-            raise
+            for sent in as_completed([pool.submit(send) for _ in range(PARALLEL)]):
+                sent.result()
+        finally:
+            over.set()
+
+
+def _to_send(photo: Photo, there: Collection[str], tally: Tally) -> bytes | None:
+    """The photo's bytes; None when there is nothing to send, which then stands in the tally."""
+    try:
+        if photo.path.stat().st_size > NO_PHOTO_BYTES:
+            raise OSError(f"it has more than {NO_PHOTO_BYTES / 1e9:.0f} GB")
+        data = photo.path.read_bytes()
+    except OSError as error:
+        why = f"The file cannot be read ({error.strerror or error}). Copy it from the card again."
+        tally.add(Uploaded(photo.name, None, "rejected", created=False, detail=why))
+        return None
+    frame_id = identify(data)
+    if tally.is_copy(photo.name, frame_id) or frame_id in there:
+        tally.add(Uploaded(photo.name, frame_id, "received", created=False))
+        return None
+    return data
 
 
 def follow(
-    client: Client, mission_id: str, tally: Tally, screen: Screen, until: Callable[[str], bool]
+    client: Client,
+    mission_id: str,
+    tally: Tally,
+    screen: Screen,
+    until: Callable[[str], bool],
+    look_around: Callable[[], None] = lambda: None,
 ) -> None:
-    """Shows the mission's progress until its state satisfies `until`. Raises StandsStill."""
+    """Shows the mission's progress until its state satisfies `until`. Raises StandsStill.
+
+    `look_around` is called while nothing moves, and raises if it sees why.
+    """
     last, moved_at = None, time.monotonic()
     while True:
         now = client.progress(mission_id)
@@ -130,16 +177,28 @@ def follow(
         mark = (tuple(counts.values()), now["revision"], now["dirty_tiles"], now["generation"], tally.sent)
         if mark != last:
             last, moved_at = mark, time.monotonic()
+        if time.monotonic() - moved_at > LOOK_AROUND_S:
+            look_around()
         if time.monotonic() - moved_at > STUCK_S:
             raise StandsStill()
         time.sleep(POLL_S)
 
 
-def deliver(client: Client, mission_id: str, out: Path, console: Console, crs: str | None = None) -> None:
+def deliver(
+    client: Client,
+    mission_id: str,
+    out: Path,
+    console: Console,
+    crs: str | None = None,
+    tally: Tally | None = None,
+) -> None:
     """Downloads the exports of a finished mission. Raises NothingToMap, with what was wrong."""
     if MOSAIC in fetch(client, mission_id, out, console, crs):
         return
     lines = [f"  {f['name']}: {f['reason']}" for f in client.frames(mission_id, "rejected")]
+    if tally:
+        lines += [f"  {name}: {why}" for name, why in sorted(tally.unread.items())]
+        lines += [f"  {name}: The same file as {first}." for name, first in sorted(tally.copies.items())]
     more = [f"  … and {len(lines) - SHOWN} more"] if len(lines) > SHOWN else []
     raise NothingToMap("\n".join(["There is no map to make of these photos:", *lines[:SHOWN], *more]))
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import signal
+import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,16 +16,26 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from services.cli.checkpoints import checkpoint_rows, read_survey, send_survey
+from core.errors import OrthostreamError
+from services.cli.checkpoints import read_survey, send_survey
 from services.cli.client import Client
-from services.cli.flight import Photo, find_photos
+from services.cli.flight import Photo, find_photos, left_out
 from services.cli.mapping import Screen, Tally, deliver, follow, upload_all
 from services.cli.serve import embedded_stack
+from services.cli.summary import listed, summary
+from services.errors import OutOfDisk
 from services.export_names import mosaic_in
 
 HOME = ".orthostream"
+FULL_BYTES = 20_000_000
+_NAME_CHARS = 120
+
+
+class BadOut(OrthostreamError):
+    """The folder for the results cannot be written to. Choose another --out."""
+
+    code = "bad_out"
 
 
 def run(
@@ -41,7 +54,8 @@ def run(
         ),
     ] = None,
     max_side: Annotated[
-        int | None, typer.Option(help="Longest side in pixels to work on; all unless set.")
+        int | None,
+        typer.Option(min=256, max=65535, help="Longest side in pixels to work on; all unless set."),
     ] = None,
     crs: Annotated[
         str | None, typer.Option(help="Of mosaic.tif, as EPSG:3857; else the flight's UTM zone.")
@@ -49,7 +63,9 @@ def run(
     server: Annotated[
         str | None, typer.Option(help="URL of a running orthostream; else one is started.")
     ] = None,
-    pace: Annotated[float | None, typer.Option(help="Photos a second, as if they were flown now.")] = None,
+    pace: Annotated[
+        float | None, typer.Option(min=0.001, help="Photos a second, as if they were flown now.")
+    ] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the map's server up until Ctrl-C.")] = False,
 ) -> None:
     """Map a folder of photos. Run again, it continues where it stopped."""
@@ -58,20 +74,43 @@ def run(
     if crs:
         mosaic_in(crs)  # a wrong one shall not show after an hour's work
     console = Console(stderr=False)
-    found = find_photos(photos)
+    found = find_photos(photos, out)
+    _say_left_out(photos, console)
     survey = read_survey(gcp, use_gcp or [])
+    make_writable(out / HOME)
     with stop_on_signals(), _service(server, out / HOME, console) as url:
-        client = Client(url)
+        client = Client(url, say=lambda line: console.print(line, style="yellow", markup=False))
         try:
+            client.greet()
             mission_id = _mission(client, out / HOME, photos, mode, max_side)
             send_survey(client, mission_id, survey)
-            map_photos(client, mission_id, found, out, console, 1 / pace if pace else 0.0, crs)
-            summary(out, console, f"{url}/missions/{mission_id}" if keep or server else None)
+            tally = map_photos(client, mission_id, found, out, console, 1 / pace if pace else 0.0, crs)
+            summary(out, console, f"{client.url}/missions/{mission_id}" if keep or server else None, tally)
             if keep:
-                console.print(f"The map stays up at {url}/missions/{mission_id} until Ctrl-C.")
+                console.print(f"The map stays up at {client.url}/missions/{mission_id} until Ctrl-C.")
                 threading.Event().wait()
+        except KeyboardInterrupt:
+            console.print("Stopped. The same command continues where it stopped.")
+            raise
         finally:
             client.close()
+
+
+def make_writable(folder: Path) -> None:
+    """Makes the folder, and a file in it for a moment: better now than after an hour. Raises BadOut."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise BadOut(f"{folder} cannot be written to ({error.strerror}). Choose another --out.") from error
+
+
+def _say_left_out(photos: Path, console: Console) -> None:
+    names = [p.name for p in left_out(photos)]
+    if names:
+        said = f"Left out, being neither JPEG nor TIFF: {listed(names)}. Export them as JPEG."
+        console.print(said, style="yellow", highlight=False, markup=False, soft_wrap=True)
 
 
 @contextmanager
@@ -110,7 +149,8 @@ def _mission(client: Client, home: Path, photos: Path, mode: str, max_side: int 
         return str(before["mission"])
     folder = photos.resolve()
     name = folder.parent.name if folder.name in ("images", "photos") else folder.name
-    mission_id = client.create(name or "Mission", mode, max_side)
+    shown = os.fsencode(name).decode("utf-8", "replace")[:_NAME_CHARS]
+    mission_id = client.create(shown or "Mission", mode, max_side)
     home.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(wanted | {"mission": mission_id}))
     return mission_id
@@ -124,8 +164,8 @@ def map_photos(
     console: Console,
     pace_s: float = 0.0,
     crs: str | None = None,
-) -> None:
-    """Everything from the first upload to the last export. Raises NothingToMap."""
+) -> Tally:
+    """Everything from the first upload to the last export. Raises NothingToMap, OutOfDisk, StandsStill."""
     tally = Tally()
     failed: list[BaseException] = []
 
@@ -135,41 +175,18 @@ def map_photos(
         except BaseException as error:
             failed.append(error)
 
+    def look() -> None:
+        if shutil.disk_usage(out).free < FULL_BYTES:
+            raise OutOfDisk(f"The disk of {out} is full. Free some space and run again: nothing was lost.")
+
     # A daemon: Ctrl-C need not wait for uploads that a dead network holds up.
     uploads = threading.Thread(target=upload, name="uploads", daemon=True)
     with Screen(console, len(photos)) as screen:
         uploads.start()
-        follow(client, mission_id, tally, screen, lambda _: not uploads.is_alive())
+        follow(client, mission_id, tally, screen, lambda _: not uploads.is_alive(), look)
         if failed:
             raise failed[0]
         client.finalise(mission_id)
-        follow(client, mission_id, tally, screen, lambda state: state == "final")
-    deliver(client, mission_id, out, console, crs)
-
-
-def summary(out: Path, console: Console, url: str | None) -> None:
-    """A table of what came out."""
-    report = json.loads((out / "report.json").read_text())
-    counts, latency = report["counts"], report.get("latency_s") or {}
-    table = Table(title="Map finished", show_header=False)
-    rows: list[tuple[str, str]] = [
-        ("photos", f"{report['frames']} ({counts['fused']} on the map, {counts['rejected']} rejected)"),
-        ("seconds", _number(report.get("seconds"), "{:.1f}")),
-        (
-            "photos a second",
-            _number(report["frames"] / report["seconds"] if report.get("seconds") else None, "{:.2f}"),
-        ),
-        ("upload to tile", f"p50 {latency.get('p50', '–')} s, p95 {latency.get('p95', '–')} s"),
-        ("reprojection", _number(report.get("reprojection_rms_px"), "{:.2f} px")),
-        ("tiles", str(report.get("tiles"))),
-    ]
-    rows += checkpoint_rows(report.get("checkpoints"))
-    for name, value in [*rows, ("map", str(out / "mosaic.tif")), *([("live map", url)] if url else [])]:
-        table.add_row(name, value)
-    console.print(table)
-    for rejected in report["rejected"]:
-        console.print(f"rejected {rejected['name']}: {rejected['reason']}", style="yellow", highlight=False)
-
-
-def _number(value: float | None, form: str) -> str:
-    return "–" if value is None else form.format(value)
+        follow(client, mission_id, tally, screen, lambda state: state == "final", look)
+    deliver(client, mission_id, out, console, crs, tally)
+    return tally
