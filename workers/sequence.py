@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from core.matching import PairMatch
-from core.mosaic import lay_out
-from core.neighbours import Sighting, candidates
-from core.pose_graph import GraphFrame, Solution, place, solve
+from core.mosaic import lay_out, solved
+from core.neighbours import Sighting
+from core.pose_graph import GraphFrame, Solution, place
+from core.submaps import Canonical, SubmapGraph, canonical, joins
 from services.catalog import backlog, frames, missions, pairs, poses, surveys, tiles
 from services.catalog.backlog import Backlog
 from services.catalog.pairs import Key as PairKey
@@ -24,6 +25,8 @@ from workers.posing import Known, changed, everything, joined, update_of
 
 GROWTH = 1.5
 """All poses are solved again when the mission has grown so many times since the last time."""
+MERGE_GROWTH = 1.02
+"""When new frames tie submaps that were apart, so much is enough."""
 FEW = 8
 ASK_AGAIN_S = 60.0
 LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 8, 16, 24
@@ -112,24 +115,25 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
     posed = set(known.layout.frames) if known.layout else set()
     total = len(posed | new_ids)
     before, solution = known.layout, known.solution
-    if solution is None or total < FEW or total >= GROWTH * known.solved_frames:
+    matches = _matches(mission.id, new_ids)
+    if solution is None or total < FEW or total >= _enough(known, new_ids, matches):
         # All that were ever read: what came since may tie in a frame that had no place before.
-        solved = _solve_all(mission, known)
+        found, graph = _solve_all(mission, known)
+        found = surveyed.held(found, known.seen, surveyed.points_of(mission.id))
         zoom_now = before.zoom if before is not None else None
-        after = lay_out(solved, known.camera_keys, _thumb(mission.id), mission.max_side, zoom_now)
+        after = lay_out(found, known.camera_keys, _thumb(mission.id), mission.max_side, zoom_now)
         dirty = changed(before, after)
         rezoomed = before is not None and before.zoom is not None and before.zoom != after.zoom
         if rezoomed:
             dirty = everything(after, _published(mission.id))
         update = update_of(after, known.camera_keys, after.frames.keys())
-        update = replace(update, solved_frames=total, reprojection_rms_px=solved.reprojection_rms_px)
-        known.solved_frames, known.reprojection_rms_px = total, solved.reprojection_rms_px
+        rms_px = found.reprojection_rms_px
+        update = replace(update, solved_frames=total, reprojection_rms_px=rms_px, submaps=graph.to_json())
+        known.solved_frames, known.reprojection_rms_px = total, rms_px
     else:
         assert before is not None
-        matches = _matches(mission.id, new_ids)
-        graph = [known.seen[k] for k in sorted(posed | new_ids)]
-        solved = place(solution, graph, new_ids, matches)
-        after = joined(before, solved, new_ids, known.camera_keys)
+        found = place(solution, [known.seen[k] for k in sorted(posed | new_ids)], new_ids, matches)
+        after = joined(before, found, new_ids, known.camera_keys)
         dirty = changed(before, after)
         update = update_of(after, known.camera_keys, new_ids)
     with db.write() as tx:
@@ -139,10 +143,16 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
     log.info("posed", mission=mission.id, new=len(new_ids), posed=len(after.frames), dirty=len(dirty))
 
 
-def _solve_all(mission: Mission, known: Known) -> Solution:
+def _enough(known: Known, new_ids: set[str], matches: Sequence[PairMatch]) -> float:
+    """How many frames the mission must have for all to be solved again."""
+    placed = known.layout.frames if known.layout else {}
+    merged = {k: f.pose.submap for k, f in placed.items() if f.pose.source != "gnss"}
+    return (MERGE_GROWTH if joins(merged, new_ids, matches) else GROWTH) * known.solved_frames
+
+
+def _solve_all(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:
     matches = _matches(mission.id, None) if mission.mode == "visual" else []
-    solved = solve([known.seen[k] for k in sorted(known.seen)], matches)
-    return surveyed.held(solved, known.seen, surveyed.points_of(mission.id))
+    return solved([known.seen[k] for k in sorted(known.seen)], Canonical((), (), tuple(matches)))
 
 
 def _matches(mission_id: str, touching: set[str] | None) -> list[PairMatch]:
@@ -169,19 +179,20 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
             missions.finish(tx, mission.id, epoch)
         return False
     graph = {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in seen}
-    wanted = _canonical_pairs(mission, list(graph.values()))
-    if not _all_matched(mission.id, wanted):
+    pairs_of_all = _canonical_pairs(mission, list(graph.values()))
+    if pairs_of_all is None:
         return False
-    matches = [m for m in _matches(mission.id, None) if (m.low, m.high) in wanted]
     points = surveyed.points_of(mission.id)
-    solved = surveyed.held(solve(list(graph.values()), matches), graph, points)
+    found, submaps = solved(list(graph.values()), pairs_of_all)
+    found = surveyed.held(found, graph, points)
     keys = {k: f.meta.camera_key for k, f in graph.items()}
-    layout = lay_out(solved, keys, _thumb(mission.id), mission.max_side)
+    layout = lay_out(found, keys, _thumb(mission.id), mission.max_side)
     update = replace(
         update_of(layout, keys, layout.frames.keys()),
         dirty=everything(layout, _published(mission.id)),
         solved_frames=len(graph),
-        reprojection_rms_px=solved.reprojection_rms_px,
+        reprojection_rms_px=found.reprojection_rms_px,
+        submaps=submaps.to_json(),
         final=True,
     )
     with db.write() as tx:
@@ -189,14 +200,15 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
             return True  # other points came meanwhile
         generation = poses.save(tx, mission.id, epoch, update)
         clock.spend(tx, mission.id, "solve")
-    _known[mission.id] = Known(generation, layout, len(graph), solved.reprojection_rms_px, graph)
+    _known[mission.id] = Known(generation, layout, len(graph), found.reprojection_rms_px, graph)
     log.info("solved finally", mission=mission.id, frames=len(graph), posed=len(layout.frames))
     return True
 
 
-def _canonical_pairs(mission: Mission, graph: Sequence[GraphFrame]) -> set[PairKey]:
+def _canonical_pairs(mission: Mission, graph: Sequence[GraphFrame]) -> Canonical | None:
+    """None while some are not matched yet."""
     if mission.mode != "visual":
-        return set()
+        return Canonical((), (), ())
     sightings = [
         Sighting(
             f.frame_id,
@@ -208,7 +220,14 @@ def _canonical_pairs(mission: Mission, graph: Sequence[GraphFrame]) -> set[PairK
         )
         for f in graph
     ]
-    return set(candidates(sightings))
+    return canonical(sightings, lambda wanted: _matched(mission.id, set(wanted)))
+
+
+def _matched(mission_id: str, wanted: set[PairKey]) -> list[PairMatch] | None:
+    """The accepted ones of these pairs, once all are computed."""
+    if not _all_matched(mission_id, wanted):
+        return None
+    return [m for m in _matches(mission_id, None) if (m.low, m.high) in wanted]
 
 
 def _all_matched(mission_id: str, wanted: set[PairKey]) -> bool:
