@@ -240,8 +240,8 @@ def _all_matched(mission_id: str, wanted: set[PairKey]) -> bool:
         send("match", mission_id, None, ask[start : start + PAIRS_PER_TASK])
     _asked.update({(mission_id, p): now + ASK_AGAIN_S for p in ask})
     if not missing:
-        for key in [k for k in _asked if k[0] == mission_id]:
-            del _asked[key]
+        for pair in wanted:
+            _asked.pop((mission_id, pair), None)
     return not missing
 
 
