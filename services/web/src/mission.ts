@@ -86,6 +86,7 @@ export class MissionPage {
   private mission: Mission;
   private readonly refreshFrames = throttled(() => this.loadFrames());
   private readonly refreshRejected = throttled(() => this.loadRejected());
+  private readonly refreshExports = throttled(() => this.loadExports());
   private readonly refreshMission = throttled(() => this.loadMission());
 
   constructor(root: HTMLElement, mission: Mission, private readonly uploads: Uploads) {
@@ -130,7 +131,7 @@ export class MissionPage {
     this.panel.setMission(mission);
     this.showEmpty();
     if (mission.zoom !== null) void this.map.showTiles(mission.zoom);
-    void this.loadExports();
+    this.refreshExports();
   }
 
   private listen(): void {
@@ -149,7 +150,7 @@ export class MissionPage {
         this.showEmpty();
         if (rejected) this.refreshRejected();
       },
-      exports: () => void this.loadExports(),
+      exports: () => this.refreshExports(),
       mission: () => this.refreshMission(),
       connection: (up) => {
         this.panel.setConnection(up);
@@ -184,17 +185,23 @@ export class MissionPage {
     const asked = exports.filter((doc) => doc.state === "wanted").map((doc) => doc.name);
     this.panel.setExports(exports, new Set([...asked, ...this.downloading]), this.mission.progress.revision > 0);
     // What somebody clicked on here and is made by now goes on by itself.
-    for (const doc of exports) if (doc.state !== "wanted" && this.downloading.delete(doc.name)) void this.download(doc);
+    for (const doc of exports) {
+      if (doc.state === "ready" && this.downloading.delete(doc.name)) void this.download(doc);
+      if (doc.state === "failed" && this.downloading.delete(doc.name)) this.say(doc.error ?? "This file could not be made.");
+    }
   }
 
   private async download(doc: ExportDoc): Promise<void> {
     try {
-      if ((await api.wantExport(doc)) === "ready") h("a", { href: doc.url, download: doc.name }).click();
-      else this.downloading.add(doc.name);
+      this.downloading.add(doc.name);
+      if ((await api.wantExport(doc)) === "wanted") return this.refreshExports();
+      this.downloading.delete(doc.name);
+      h("a", { href: doc.url, download: doc.name }).click();
     } catch (error) {
+      this.downloading.delete(doc.name);
       this.say(error instanceof Problem ? (doc.error ?? error.message) : OFFLINE);
     }
-    void this.loadExports();
+    this.refreshExports();
   }
 
   private showEmpty(): void {

@@ -91,6 +91,7 @@ export class Panel {
   private readonly finalise: HTMLButtonElement;
   private readonly finaliseHint = h("p", { class: "note" });
   private lastLegend = "";
+  private lastExports = "";
 
   constructor(private readonly actions: PanelActions) {
     this.finalise = h("button", { class: "primary", onclick: () => actions.finalise() }, icon(ICONS.check), "Finalise map");
@@ -208,6 +209,10 @@ export class Panel {
   }
 
   setExports(exports: ExportDoc[], wanted: ReadonlySet<string>, onMap: boolean): void {
+    // A list that is drawn again under the pointer loses the click.
+    const now = JSON.stringify([exports, [...wanted], onMap]);
+    if (now === this.lastExports) return;
+    this.lastExports = now;
     if (!onMap) fill(this.downloads, h("li", { class: "note" }, "As soon as there is something on the map."));
     else fill(this.downloads, ...exports.map((doc) => this.download(doc, wanted.has(doc.name))));
   }
