@@ -16,16 +16,23 @@ from core.pose_graph.residuals import Edges, Normal, State, linearise, retract
 # A step of less than this share of the height above ground (95th percentile) moves no pixel of the map.
 SETTLED = 1e-4
 HELD = 1e12
+# A step that promises less than this share of the least gain is not worth a linearisation.
+FORESEEN = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Adjusted:
-    """The optimum: `state`, `squared` (M, 2) residuals in sigmas, `cost`, linearisations done."""
+    """The optimum: `state`, its normal equations, the fronts that eliminate them, linearisations done."""
 
     state: State
-    squared: Array
-    cost: float
+    normal: Normal
+    fronts: tuple[Front, ...]
     steps: int
+
+    @property
+    def squared(self) -> Array:
+        """(M, 2) residuals in sigmas, squared."""
+        return self.normal.squared
 
 
 def normal_equations(edges: Edges, priors: Priors, state: State, sigma_px: Array, scale: float) -> Normal:
@@ -63,6 +70,9 @@ def adjust(
             done += 1
             continue
         frames, border = solved
+        foreseen = 0.5 * float((frames * normal.frame_rhs).sum() + border @ normal.border_rhs)
+        if foreseen < FORESEEN * min_gain * normal.cost:
+            break
         trial = retract(state, frames, border)
         tried = normal_equations(edges, priors, trial, sigma_px, scale)
         done += 1
@@ -76,7 +86,7 @@ def adjust(
             damping = max(damping * 30, 1e-4)
             if damping > 1e4:
                 break
-    return Adjusted(state, normal.squared, normal.cost, done)
+    return Adjusted(state, normal, fronts, done)
 
 
 def _step(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -16,6 +18,7 @@ from core.pose_graph.model import PoseParams
 from core.pose_graph.residuals import Edges, IntArray
 
 GRID = 8
+_compile: Callable[[Any], Any] = numba.njit(cache=True, nogil=True)
 
 
 def edges_of(
@@ -53,17 +56,25 @@ def spread(where: Array, group: IntArray, limit: int) -> NDArray[np.int64]:
     `where`: (M, 2) in the unit square. `group`: (M,) ascending from 0.
     """
     cell = np.clip(where * GRID, 0, GRID - 1).astype(np.int64) @ (1, GRID)
-    block = group * GRID * GRID + cell
-    order = np.argsort(block, kind="stable")
-    ranked = block[order]
-    fresh = np.concatenate(([True], ranked[1:] != ranked[:-1])) if len(ranked) else np.zeros(0, bool)
-    begin = np.maximum.accumulate(np.where(fresh, np.arange(len(ranked)), 0))
-    turn = np.empty(len(block), np.int64)
-    turn[order] = np.arange(len(ranked)) - begin
-    # within a group: first points of all cells, then second ones …
-    queue = np.lexsort((turn, group))
-    first = np.searchsorted(group, group)
-    return np.sort(queue[np.arange(len(queue)) - first < limit])
+    starts = np.searchsorted(group, np.arange(int(group[-1]) + 2 if len(group) else 1))
+    keep = np.zeros(len(cell), bool)
+    _take_turns(cell, starts, limit, keep)
+    return np.flatnonzero(keep)
+
+
+@_compile
+def _take_turns(cell: IntArray, starts: IntArray, limit: int, keep: NDArray[np.bool_]) -> None:
+    """Flag in `keep` the first points of all cells, then the second ones …, `limit` in each group."""
+    for k in range(len(starts) - 1):
+        taken, turn = 0, 1
+        while taken < min(limit, starts[k + 1] - starts[k]):
+            seen = np.zeros(GRID * GRID, np.int64)
+            for m in range(starts[k], starts[k + 1]):
+                seen[cell[m]] += 1
+                if seen[cell[m]] == turn and taken < limit:
+                    keep[m] = True
+                    taken += 1
+            turn += 1
 
 
 def submaps(n: int, pairs: IntArray, ranks: Sequence[object]) -> IntArray:

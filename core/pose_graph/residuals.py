@@ -209,45 +209,86 @@ def _spread_columns(first: int, second: int, lens_first: int, lens_second: int) 
     return T
 
 
-SPREAD = np.stack(
-    [
-        _spread_columns(0, 7, 14, 14),
-        _spread_columns(7, 0, 14, 14),
-        _spread_columns(0, 7, 14, 17),
-        _spread_columns(7, 0, 17, 14),
-    ]
+SPREAD = tuple(
+    _spread_columns(*offsets) for offsets in ((0, 7, 14, 14), (7, 0, 14, 14), (0, 7, 14, 17), (7, 0, 17, 14))
 )
+# The few numbers in those matrices: (way + 2·(two lenses), entry) → column of `_observe`, unknown, factor.
+SOURCE = np.stack([np.nonzero(T)[0] for T in SPREAD])
+TARGET = np.stack([np.nonzero(T)[1] for T in SPREAD])
+FACTOR = np.stack([T[np.nonzero(T)] for T in SPREAD])
+
+
+def _gather(K: Array, source: IntArray, target: IntArray, factor: Array, H: Array, g: Array) -> None:
+    """Turn the products K (17, 17) of `_observe`'s columns into the pair's H (20, 20) and g (20), in place."""
+    for p in range(len(source)):
+        row, a, fp = source[p], target[p], factor[p]
+        g[a] -= fp * K[row, 16]
+        for q in range(len(source)):
+            H[a, target[q]] += fp * factor[q] * K[row, source[q]]
+
+
+def _scatter(
+    H: Array, g: Array, i: int, j: int, lens_i: int, lens_j: int, frame: Array, pair: Array, cross: Array,
+    border: Array, frame_rhs: Array, border_rhs: Array, at: IntArray,
+) -> None:  # fmt: skip
+    """Add one pair's blocks to those of its frames and lenses, in place."""
+    at[0], at[1], at[2], at[3] = i, j, 3 * lens_i, 3 * lens_j
+    for p in range(4):
+        first, size = (7 * p, 7) if p < 2 else (8 + 3 * p, 3)
+        for a in range(size):
+            row = first + a
+            if p < 2:
+                frame_rhs[at[p], a] += g[row]
+                for b in range(7):
+                    frame[at[p], a, b] += H[row, first + b]
+            else:
+                border_rhs[at[p] + a] += g[row]
+            for q in range(2, 4):
+                for b in range(3):
+                    if p < 2:
+                        cross[at[p], a, at[q] + b] += H[row, 8 + 3 * q + b]
+                    else:
+                        border[at[p] + a, at[q] + b] += H[row, 8 + 3 * q + b]
+    for a in range(7):
+        for b in range(7):
+            pair[a, b] = H[a, 7 + b]
 
 
 def _accumulate(
     pairs: IntArray, starts: IntArray, uv: Array, weight: Array, camera: IntArray,
-    R: Array, t: Array, h: Array, lens: Array, sigma: Array, scale: float, spread: Array,
-    H: Array, g: Array, squared: Array,
+    R: Array, t: Array, h: Array, lens: Array, sigma: Array, scale: float,
+    source: IntArray, target: IntArray, factor: Array, squared: Array,
+    frame: Array, pair: Array, cross: Array, border: Array, frame_rhs: Array, border_rhs: Array,
 ) -> float:  # fmt: skip
-    """Each pair's normal equations H (E, 20, 20) and g (E, 20), in place; the robust cost. `sigma` (C,) px,
-    `scale` of the Cauchy loss in sigmas; `squared` (M, 2) takes the squared residuals in sigmas.
+    """Add all pairs to the normal equations, in place; the robust cost. `sigma` (C,) px, `scale` of the
+    Cauchy loss in sigmas; `squared` (M, 2) takes the squared residuals in sigmas.
     """
     longest = 0
     for e in range(len(pairs)):
         longest = max(longest, starts[e + 1] - starts[e])
     # rows of all points, weighted, the residual in the last column: one product makes H and g
-    rows = np.zeros((2 * longest, 17))
-    J, r = np.zeros((2, 16)), np.zeros(2)
-    c2 = scale * scale
-    cost = 0.0
+    rows, K = np.zeros((2 * longest, 17)), np.zeros((17, 17))
+    J, r, H, g, at = np.zeros((2, 16)), np.zeros(2), np.zeros((20, 20)), np.zeros(20), np.zeros(4, np.int64)
+    c2, cost = scale * scale, 0.0
     for e in range(len(pairs)):
+        H[:], g[:] = 0.0, 0.0
+        one_lens = camera[pairs[e, 0]] == camera[pairs[e, 1]]
         for way in range(2):
             i, j = pairs[e, way], pairs[e, 1 - way]
-            li, lj = camera[i], camera[j]
-            Ri, ti, hi, Li, Rj, tj, Lj = R[i], t[i], h[i], lens[li], R[j], t[j], lens[lj]
-            a, b, used = 2 * way, 2 - 2 * way, 0
+            lj = camera[j]
+            Ri, ti, hi, Li, Rj, tj, Lj = R[i], t[i], h[i], lens[camera[i]], R[j], t[j], lens[lj]
+            a, b, used, far = 2 * way, 2 - 2 * way, 0, 1.0
             for m in range(starts[e], starts[e + 1]):
                 ok = _observe(
                     uv[m, a], uv[m, a + 1], uv[m, b], uv[m, b + 1], Ri, ti, hi, Li, Rj, tj, Lj, J, r
                 )
                 s2 = (r[0] * r[0] + r[1] * r[1]) / (sigma[lj] * sigma[lj]) if ok else 1e6
                 squared[m, way] = s2
-                cost += 0.5 * weight[e] * c2 * np.log1p(s2 / c2)
+                # the logarithm of a product: one call for many points, before it overflows
+                far *= 1 + s2 / c2
+                if far > 1e200:
+                    cost += 0.5 * weight[e] * c2 * np.log(far)
+                    far = 1.0
                 if not ok:
                     continue
                 w = np.sqrt(weight[e] / ((1 + s2 / c2) * sigma[lj] * sigma[lj]))
@@ -256,42 +297,16 @@ def _accumulate(
                         rows[used + k, col] = w * J[k, col]
                     rows[used + k, 16] = w * r[k]
                 used += 2
-            K = rows[:used].T @ rows[:used]
+            cost += 0.5 * weight[e] * c2 * np.log(far)
+            np.dot(rows[:used].T, rows[:used], K)
             # one lens shared by both frames: its columns add up
-            T = spread[way] if li == lj else spread[2 + way]
-            H[e] += T.T @ np.ascontiguousarray(K[:16, :16]) @ T
-            g[e] -= np.ascontiguousarray(K[16, :16]) @ T
+            case = way if one_lens else way + 2
+            _gather(K, source[case], target[case], factor[case], H, g)
+        li, lj = camera[pairs[e, 0]], camera[pairs[e, 1]]
+        _scatter(
+            H, g, pairs[e, 0], pairs[e, 1], li, lj, frame, pair[e], cross, border, frame_rhs, border_rhs, at
+        )
     return cost
-
-
-def _scatter(
-    pairs: IntArray, camera: IntArray, H: Array, g: Array,
-    frame: Array, pair: Array, cross: Array, border: Array, frame_rhs: Array, border_rhs: Array,
-) -> None:  # fmt: skip
-    """Sum the pairs' blocks into those of frames and lenses, in place."""
-    at, size, first = np.zeros(4, np.int64), np.array([7, 7, 3, 3]), np.array([0, 7, 14, 17])
-    for e in range(len(pairs)):
-        at[0], at[1] = pairs[e, 0], pairs[e, 1]
-        at[2], at[3] = 3 * camera[at[0]], 3 * camera[at[1]]
-        for p in range(4):
-            for a in range(size[p]):
-                row = first[p] + a
-                if p < 2:
-                    frame_rhs[at[p], a] += g[e, row]
-                    for b in range(7):
-                        frame[at[p], a, b] += H[e, row, first[p] + b]
-                else:
-                    border_rhs[at[p] + a] += g[e, row]
-                for q in range(2, 4):
-                    for b in range(3):
-                        value = H[e, row, first[q] + b]
-                        if p < 2:
-                            cross[at[p], a, at[q] + b] += value
-                        else:
-                            border[at[p] + a, at[q] + b] += value
-        for a in range(7):
-            for b in range(7):
-                pair[e, a, b] = H[e, a, 7 + b]
 
 
 _compile: Callable[[Any], Any] = numba.njit(
@@ -301,23 +316,23 @@ observe = _observe  # the plain Python function, for tests
 _undistorted = _compile(_undistorted)
 _derive = _compile(_derive)
 _observe = _compile(_observe)
-_accumulate = _compile(_accumulate)
+_gather = _compile(_gather)
 _scatter = _compile(_scatter)
+_accumulate = _compile(_accumulate)
 
 
 def linearise(edges: Edges, state: State, sigma_px: Array, robust_scale: float) -> Normal:
     """The normal equations of all pairs at `state`. `sigma_px`: (C,) of one correspondence, by camera."""
     n, e, c = len(state.R), len(edges), CAMERA_DOF * len(state.lens)
     b = c + len(state.lag_s)
-    H, g, squared = np.zeros((e, 20, 20)), np.zeros((e, 20)), np.zeros((len(edges.uv), 2))
-    cost = _accumulate(
-        edges.pairs, edges.starts, edges.uv, edges.weight, edges.camera,
-        state.R, state.t, state.h, state.lens,
-        sigma_px, robust_scale, SPREAD, H, g, squared,
-    )  # fmt: skip
+    squared = np.zeros((len(edges.uv), 2))
     frame, pair, cross = np.zeros((n, 7, 7)), np.zeros((e, 7, 7)), np.zeros((n, 7, b))
     border, frame_rhs, border_rhs = np.zeros((b, b)), np.zeros((n, 7)), np.zeros(b)
-    _scatter(edges.pairs, edges.camera, H, g, frame, pair, cross, border, frame_rhs, border_rhs)
+    cost = _accumulate(
+        edges.pairs, edges.starts, edges.uv, edges.weight, edges.camera,
+        state.R, state.t, state.h, state.lens, sigma_px, robust_scale,
+        SOURCE, TARGET, FACTOR, squared, frame, pair, cross, border, frame_rhs, border_rhs,
+    )  # fmt: skip
     return Normal(frame, pair, cross, border, frame_rhs, border_rhs, float(cost), squared)
 
 

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from core.geometry import Array, Camera, Pose, World
 from core.matching import PairMatch
 from core.pose_graph.adjustment import Adjusted, adjust
+from core.pose_graph.certainty import position_sigmas
 from core.pose_graph.fallback import gnss_poses, is_oblique
 from core.pose_graph.matchgraph import edges_of, submaps
 from core.pose_graph.model import GraphFrame, PoseParams, Solution
 from core.pose_graph.priors import Priors, gravity, heading, nadir
 from core.pose_graph.residuals import Edges, IntArray, State
 from core.pose_graph.start import Start, expected_down, starting, yaw_offsets
-from core.pose_graph.survey import Survey, survey
+from core.pose_graph.survey import Survey, capture_order, survey
 
 WILD = 10.0
 MIN_OPPOSITE = 10
@@ -37,6 +38,7 @@ class Graph:
     dropped: tuple[tuple[str, str], ...]
     gps_sigma: Array
     sigma_px: Array
+    sigma_m: Array
 
 
 def solve(
@@ -66,7 +68,7 @@ def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
     edges = replace(edges, pairs=np.searchsorted(rows, edges.pairs), camera=tied.camera)
     names = [(f.name, f.frame_id) for f in tied.frames]
     every, submap = edges, submaps(len(tied), edges.pairs, names)
-    start = starting(tied, edges, submap, params)
+    start = starting(tied, edges.thinned(params.coarse_points), submap, params)
     keep = start.edge_error < max(0.3, 6 * float(np.median(start.edge_error)))
     edges = edges.subset(keep)
     priors = priors_of(tied, start, submap, params)
@@ -85,14 +87,28 @@ def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
     ids = [f.frame_id for f in tied.frames]
     dropped = tuple((ids[i], ids[j]) for i, j in every.pairs.tolist() if (i, j) not in left)
     fine = replace(fine, steps=fine.steps + coarse.steps)
-    return Graph(tied, rows, edges, fine, dropped, priors.gps_sigma, sigma)
+    sigma_m = position_sigmas(fine, _origins(tied, edges.pairs, names))
+    return Graph(tied, rows, edges, fine, dropped, priors.gps_sigma, sigma, sigma_m)
+
+
+def _origins(s: Survey, pairs: IntArray, names: Sequence[tuple[str, str]]) -> IntArray:
+    """The first frame of each submap that no GPS holds."""
+    label = submaps(len(s), pairs, names)
+    first: dict[int, int] = {}
+    for k in sorted(range(len(s)), key=lambda k: capture_order(s.frames[k])):
+        first.setdefault(int(label[k]), k)
+    held = set(label[s.has_gps].tolist())
+    return np.array([k for submap, k in sorted(first.items()) if submap not in held], np.int64)
 
 
 def _right_edges(edges: Edges, squared: Array, limit: float) -> NDArray[np.bool_]:
     """(E,) which pairs agree with the rest: by the median of their residuals, in sigmas."""
-    middle = np.array(
-        [np.median(squared[a:b]) for a, b in zip(edges.starts[:-1], edges.starts[1:], strict=True)]
-    )
+    counts = 2 * np.diff(edges.starts)
+    padded = np.full((len(edges), int(counts.max(initial=1))), np.inf)
+    padded[np.arange(padded.shape[1]) < counts[:, None]] = squared.ravel()
+    padded.sort(axis=1)
+    rows = np.arange(len(edges))
+    middle = (padded[rows, (counts - 1) // 2] + padded[rows, counts // 2]) / 2
     residual = np.sqrt(middle)
     return np.asarray(residual <= max(limit, 4 * float(np.median(residual))))
 
@@ -265,8 +281,14 @@ def _visual(s: Survey, graph: Graph, label: IntArray) -> dict[str, Pose]:
             ground_h_m=float(state.h[k]),
             source="vision-only" if nowhere else "visual",
             submap=int(label[row]),
+            sigma_m=_triple(graph.sigma_m[k]),
         )
     return poses
+
+
+def _triple(sigma: Array) -> tuple[float, float, float] | None:
+    east, north, up = (float(v) for v in sigma)
+    return (east, north, up) if np.isfinite(sigma).all() else None
 
 
 def reprojection_rms(graph: Graph, params: PoseParams) -> float:
