@@ -77,12 +77,17 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class PointError:
-    """How far one point lies off in the mean of its photos, metres east and north."""
+    """How far one point lies off in the mean of its photos, metres east and north.
+
+    At the point's own height, and in the ground planes (`plane_…`), see CheckpointErrors.
+    """
 
     point: str
     sightings: int
     east_m: float
     north_m: float
+    plane_east_m: float
+    plane_north_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,11 +215,13 @@ def point_errors(seen: Sequence[Observation]) -> dict[str, PointError]:
     """Every point that was seen, used or not, by name."""
     groups: dict[str, list[Array]] = {}
     for o in seen:
-        groups.setdefault(o.sighting.point, []).append(o.own - o.truth[:2])
-    means = {point: np.mean(groups[point], axis=0) for point in sorted(groups)}
+        off = np.concatenate((o.own - o.truth[:2], o.plane - o.at_plane))
+        groups.setdefault(o.sighting.point, []).append(off)
     return {
-        p: PointError(p, len(groups[p]), round(float(m[0]), 4), round(float(m[1]), 4))
-        for p, m in means.items()
+        point: PointError(
+            point, len(groups[point]), *(round(float(v), 4) for v in np.mean(groups[point], axis=0))
+        )
+        for point in sorted(groups)
     }
 
 
