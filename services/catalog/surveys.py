@@ -20,7 +20,9 @@ def put(tx: Session, mission_id: str, content: str | None, used: list[str], now:
     now = clock(now)
     before, used = get(tx, mission_id), sorted(set(used))
     if before is None:
-        before = Survey(mission_id=mission_id, content=None, used=[])
+        if content is None:
+            return False
+        before = Survey(mission_id=mission_id, content=None, used=[], changed_at=now)
         tx.add(before)
     if (before.content, before.used) == (content, used):
         return False

@@ -16,10 +16,10 @@ from services.errors import OutOfDisk
 
 RETRY_S = 300.0
 GREETING_S = 10.0
-FULL_DISK_S = 10.0
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.3, 10.0
 _AGAIN = (408, 425, 429, 500, 502, 503, 504, 507)
 _FULL_DISK = 507
+_PATIENCE_S = {500: 30.0, _FULL_DISK: 10.0}  # what more of the same question seldom mends
 _SAY_EVERY_S = 30.0
 
 
@@ -191,8 +191,7 @@ class Client:
             give_up_at = began + (self._retry_s if retry_s is None else retry_s)
             try:
                 answer = ask()
-                if answer.status_code == _FULL_DISK:
-                    give_up_at = min(give_up_at, began + FULL_DISK_S)
+                give_up_at = min(give_up_at, began + _PATIENCE_S.get(answer.status_code, math.inf))
                 if answer.status_code not in _AGAIN or time.monotonic() + pause_s > give_up_at:
                     return answer
                 trouble = str(_problem(answer).get("detail") or f"it answers {answer.status_code}")
