@@ -141,11 +141,12 @@ def _crs(header: str) -> CRS:
     try:
         if utm:
             return CRS.from_epsg((32700 if (utm[2] or "N").upper() == "S" else 32600) + int(utm[1]))
-        return CRS.from_user_input(header)
-    except CRSError as error:
-        raise BadCheckpoints(
-            f"The checkpoint file's first line is {header!r:.80}, not a CRS such as EPSG:32632."
-        ) from error
+        crs = CRS.from_user_input(header)
+        if crs.is_projected or crs.is_geographic:
+            return crs
+    except CRSError:
+        pass
+    raise BadCheckpoints(f"The checkpoint file's first line is {header!r:.80}, not a CRS such as EPSG:32632.")
 
 
 def _fields(line: str) -> list[str]:
