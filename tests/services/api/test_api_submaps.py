@@ -49,6 +49,7 @@ def pose(services: Services, mission_id: str, homes: dict[str, int], **change: o
             at = Pose(DOWN, np.array([30.0 * i, 0.0, 60.0]), 0.0, source, submap)  # type: ignore[arg-type]
             placed.append(Placed(frame_id, "one", at, TileBox(19, 1, 1, 1, 1)))
         poses.save(tx, mission_id, epoch, PoseUpdate(placed=placed, **change))  # type: ignore[arg-type]
+        leases.release(tx, mission_id, "test", epoch)
 
 
 def match(services: Services, mission_id: str, verdicts: dict[tuple[int, int], str]) -> None:
