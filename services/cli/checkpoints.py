@@ -66,8 +66,9 @@ def checkpoint_rows(checked: Mapping[str, Any] | None) -> list[tuple[str, str]]:
         rows.append(("checkpoints, poses", f"{seen}: {errors}"))
     if mosaic:
         found = f"{mosaic['found']} of {_points(mosaic['points'])} found"
-        errors = _errors(mosaic["raw_m"], mosaic["debiased_m"], mosaic["similarity_m"])
-        rows.append(("checkpoints, mosaic", f"{found}: {errors}" if mosaic["found"] else found))
+        if mosaic["found"]:
+            found += f": {_errors(mosaic['raw_m'], mosaic['debiased_m'], mosaic['similarity_m'])}"
+        rows.append(("checkpoints, mosaic", found))
     return rows or [("checkpoints", "none of them is seen in a posed photo")]
 
 
