@@ -132,3 +132,18 @@ def test_logs_are_readable_and_hold_no_secrets(tmp_path: Path, as_json: bool) ->
             "info",
         )
         assert second["event"] == "cannot reach postgresql://me:***@host/d"
+
+
+def test_a_traceback_does_not_tell_local_variables() -> None:
+    out = io.StringIO()
+    configure_logging(Settings(log_json=False), process="test", stream=out)
+
+    def fails(word: str) -> None:
+        raise ValueError(str(len(word)))
+
+    try:
+        fails("-".join(["hush"] * 2))
+    except ValueError:
+        logging.getLogger("test").exception("it failed")
+    assert "ValueError: 9" in out.getvalue()
+    assert "hush-hush" not in out.getvalue()
