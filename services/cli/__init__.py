@@ -21,6 +21,7 @@ def _run() -> None:
 
     from core.errors import OrthostreamError
     from services.cli.demo import demo
+    from services.cli.migrate import migrate
     from services.cli.run import run
     from services.cli.serve import serve
     from services.cli.simulate import simulate
@@ -32,7 +33,7 @@ def _run() -> None:
         add_completion=False,
         pretty_exceptions_enable=False,
     )
-    for command in (run, serve, demo):
+    for command in (run, serve, demo, migrate):
         commands.command()(command)
     commands.command(context_settings=SETTINGS)(simulate)
     try:
