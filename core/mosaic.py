@@ -24,7 +24,8 @@ from core.metadata import read_metadata
 from core.neighbours import Pair, Sighting
 from core.photo import probe
 from core.pose_graph import GraphFrame, Solution, solve
-from core.submaps import Canonical, SubmapGraph, canonical, submap_graph
+from core.submaps import SubmapGraph, submap_graph
+from core.ties import Canonical, canonical
 
 FEATURE_SIDE_PX = FeatureParams().side_px
 """Keypoints are found on a copy of this size, so nothing larger is decoded for them."""
@@ -173,8 +174,8 @@ def build(photos: Sequence[tuple[str, bytes]], max_side: int | None = None, mode
 def solved(frames: Sequence[GraphFrame], pairs: Canonical) -> tuple[Solution, SubmapGraph]:
     """The final poses, and which submaps they were made of; a function of the sets."""
     solution = solve(frames, pairs.matches)
-    merged = {k: pose.submap for k, pose in solution.poses.items()}
-    return solution, submap_graph(frames, pairs.matches, merged, solution.dropped_pairs, pairs.extra)
+    submaps = submap_graph(frames, pairs.matches, solution.poses, solution.dropped_pairs, pairs.extra)
+    return solution, submaps
 
 
 def draw(layout: Layout, photos: _Photos) -> dict[TileKey, bytes]:

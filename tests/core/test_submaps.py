@@ -25,18 +25,15 @@ from core.photography import GroundPicture, develop, expose
 from core.pose_graph import GraphFrame, Solution
 from core.simulation import Flight, FlightParams, Shot, look_down, plan_flight
 from core.submaps import (
-    Canonical,
     SubmapGraph,
-    canonical,
     intersection_angles_deg,
     joins,
     parts,
     spanning,
     strength,
     submap_graph,
-    thresholds,
-    ties_to_try,
 )
+from core.ties import Canonical, canonical, thresholds, ties_to_try
 
 CELL_M = 8.0
 TIES = st.lists(st.tuples(st.integers(0, 7), st.integers(0, 7), st.integers(1, 40)), max_size=20)
@@ -183,6 +180,22 @@ def test_the_intersection_angle_needs_no_pose(baseline_m: float, turned_deg: flo
     cosine = (rays[0] * rays[1]).sum(1) / np.linalg.norm(rays[0], axis=1) / np.linalg.norm(rays[1], axis=1)
     truth = np.degrees(np.arccos(cosine.clip(-1, 1)))
     assert intersection_angles_deg(match, camera, camera) == pytest.approx(truth, abs=0.1)
+
+
+def test_poses_tell_the_intersection_angle_of_tilted_cameras() -> None:
+    camera = FlightParams().camera()
+    poses = [
+        Pose(look_down(0.4, 0.2, -0.1), np.array([0, 0, 60.0]), 0.0),
+        Pose(look_down(2.0, -0.1, 0.2), np.array([30.0, 5, 70.0]), 0.0),
+    ]
+    east, north = np.random.default_rng(0).uniform(-9, 9, (2, 50))
+    points = np.column_stack((east + 15, north, np.zeros(50)))
+    uv = [p.pixels(camera, points).astype(np.float32) for p in poses]
+    match = PairMatch("a", "b", True, "ok", uv[0], uv[1], MatchCounts())
+    rays = [(points - p.center) / np.linalg.norm(points - p.center, axis=1)[:, None] for p in poses]
+    truth = np.degrees(np.arccos((rays[0] * rays[1]).sum(1)))
+    turn = poses[0].world_R_cam.T @ poses[1].world_R_cam
+    assert intersection_angles_deg(match, camera, camera, turn) == pytest.approx(truth, abs=0.1)
 
 
 def test_thresholds_are_what_half_an_overlap_looks_like_to_the_frame_itself() -> None:
@@ -399,9 +412,8 @@ def test_the_graph_of_submaps_does_not_depend_on_the_order() -> None:
     w = drones_that_meet_once()
     found = w.canonical()
     solution, graph = solved(w.frames, found)
-    merged = {k: p.submap for k, p in solution.poses.items()}
     dropped = solution.dropped_pairs
-    assert submap_graph(w.frames[::-1], found.matches[::-1], merged, dropped, found.extra) == graph
+    assert submap_graph(w.frames[::-1], found.matches[::-1], solution.poses, dropped, found.extra) == graph
 
 
 def test_a_frame_that_sees_two_maps_joins_them() -> None:

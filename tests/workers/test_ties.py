@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from core import neighbours, submaps
+from core import neighbours, ties
 from core.mosaic import build
 from core.neighbours import NeighbourParams, Pair, Sighting
 from core.simulation import FlightParams
@@ -39,7 +39,7 @@ def test_ties_tried_between_submaps_are_the_oracles(
         drone = {f.frame_id: f.drone for f in frames}
         return [(a, b) for a, b in own(frames, FEW_NEIGHBOURS) if drone[a] == drone[b]]
 
-    monkeypatch.setattr(submaps, "candidates", one_drone)
+    monkeypatch.setattr(ties, "candidates", one_drone)
     oracle = build(strips)
     assert {p.submap for p in oracle.solution.poses.values()} == {0}
     assert oracle.submaps.tried > 0
