@@ -10,7 +10,8 @@ from core.matching import PairMatch
 from core.mosaic import lay_out, solved
 from core.neighbours import Sighting
 from core.pose_graph import GraphFrame, Solution, place
-from core.submaps import Canonical, SubmapGraph, canonical, joins
+from core.submaps import SubmapGraph, joins
+from core.ties import Canonical, canonical
 from services.catalog import backlog, frames, missions, pairs, poses, surveys, tiles
 from services.catalog.backlog import Backlog
 from services.catalog.pairs import Key as PairKey
