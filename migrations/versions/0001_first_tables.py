@@ -28,9 +28,17 @@ def upgrade() -> None:
 def downgrade() -> None:
     """Nothing is left."""
     for name in (
-        "exports", "events", "dirty_tiles", "tile_versions", "tiles", "leases", "frame_poses", "pairs", "frames",
+        "exports",
+        "events",
+        "dirty_tiles",
+        "tile_versions",
+        "tiles",
+        "leases",
+        "frame_poses",
+        "pairs",
+        "frames",
         "missions",
-    ):  # fmt: skip
+    ):
         op.drop_table(name)
 
 

@@ -9,7 +9,7 @@ from services.settings import get_settings
 
 
 def migrate() -> None:
-    """Bring the database of ORTHOSTREAM_DATABASE_URL to the newest schema (the embedded one does it itself)."""
+    """Bring the database that ORTHOSTREAM_DATABASE_URL names to the newest schema; the embedded one needs none."""
     database = Database(get_settings().database_url)
     database.upgrade()
     database.close()
