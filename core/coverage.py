@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.fusion import FrameIndex, FusionParams, Photos, render
 from core.geometry import Array, PosedFrame, World
@@ -145,6 +146,27 @@ def pyramid(natives: Mapping[TileKey, bytes]) -> dict[TileKey, bytes]:
         if encoded is not None:
             tiles[tile] = above[tile] = encoded[0]
     return above
+
+
+def inside(outline: Array, points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 2) lie in a convex outline (M, 2) given in order; both in one plane."""
+    edges = np.roll(outline, -1, 0) - outline
+    offsets = points[:, None] - outline
+    side = edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0]
+    return np.asarray((side >= 0).all(1) | (side <= 0).all(1))
+
+
+def shows_all_of(tile: TileKey, outlines: Iterable[Array | None]) -> bool:
+    """Whether these outlines (4, 2), pixels of the tile's zoom, leave nothing of the tile uncovered."""
+    steps = np.linspace(0, TILE_PX, 9)
+    xs, ys = np.meshgrid(tile.x * TILE_PX + steps, tile.y * TILE_PX + steps)
+    points = np.column_stack((xs.ravel(), ys.ravel()))
+    for outline in outlines:
+        if outline is not None:
+            points = points[~inside(outline, points)]
+        if not len(points):
+            return True
+    return False
 
 
 def moved_px(before: Array | None, after: Array | None) -> float:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from core import errors
-from core.coverage import moved_px, outline_px, tiles_under
-from core.geometry import PosedFrame
+from core.coverage import moved_px, outline_px, shows_all_of, tiles_under
+from core.geometry import Array, PosedFrame
 from core.grid import TileKey, ancestors
 from core.mosaic import MOST_TILES, Layout
 from core.pose_graph import GraphFrame, Solution
@@ -17,8 +17,9 @@ from services.catalog.frames import Seen
 from services.catalog.poses import Placed, Poses, PoseUpdate
 from services.catalog.tiles import Key, TileBox
 
-NEW, GROWN, HEAL = 0, 1, 5
-"""Priorities of dirty tiles: where nothing was shown yet, where a photo came in, where poses moved."""
+NEW, GROWN, HEAL, DEFERRED = 0, 1, 5, 9
+"""Priorities of dirty tiles: where nothing was shown yet, where ground was added, where poses moved, and
+where a photo only shows better what is shown already: that waits until nothing else is to be done."""
 SHOWN_MOVE_PX = 0.5
 SHOWN_GAIN = 0.02
 
@@ -32,6 +33,7 @@ class Known:
     solved_frames: int
     reprojection_rms_px: float = 0.0
     seen: dict[str, GraphFrame] = field(default_factory=dict)
+    deferred: set[Key] = field(default_factory=set)
 
     @classmethod
     def read(cls, poses: Poses, sightings: Iterable[Seen], rms_px: float | None) -> Known:
@@ -97,25 +99,42 @@ def _gain_nearby(frame: PosedFrame, others: Mapping[str, PosedFrame]) -> tuple[f
 
 
 def changed(before: Layout | None, after: Layout) -> dict[Key, int]:
-    """Native tiles that look different now, each with its priority."""
+    """Native tiles that look different now, each with its priority: DEFERRED where there is no new ground."""
     if before is None or before.zoom is None:
         return dict.fromkeys(after.cover, NEW)
     shown = before.cover
     dirty: dict[Key, int] = {}
+    news: set[TileKey] = set()
 
     def touch(tiles: Iterable[TileKey], priority: int) -> None:
         for tile in tiles:
-            dirty[tile] = min(dirty.get(tile, 9), priority)
+            dirty[tile] = min(dirty.get(tile, DEFERRED), priority)
 
     for frame_id in sorted(before.frames.keys() | after.frames.keys()):
         old, new = before.frames.get(frame_id), after.frames.get(frame_id)
         if new is not None and old is None:
-            touch(after.under[frame_id], GROWN)
+            news |= after.under[frame_id]
         elif new is None:
             touch(before.under[frame_id], HEAL)
         elif old is not None and _looks_other(old, new, before, after):
             touch(before.under[frame_id] | after.under[frame_id], HEAL)
+    full = _full(news & shown, before)
+    touch(full, DEFERRED)
+    touch(news - full, GROWN)
     return {tile: NEW if tile not in shown else priority for tile, priority in dirty.items()}
+
+
+def _full(tiles: set[TileKey], layout: Layout) -> set[TileKey]:
+    """Those of the tiles all of whose ground the layout's frames show already."""
+    assert layout.zoom is not None
+    outlines: dict[TileKey, list[Array | None]] = {tile: [] for tile in tiles}
+    for frame_id, under in sorted(layout.under.items()):
+        common = under & tiles
+        if common:
+            outline = outline_px(layout.frames[frame_id], layout.world, layout.zoom)
+            for tile in common:
+                outlines[tile].append(outline)
+    return {tile for tile in tiles if shows_all_of(tile, outlines[tile])}
 
 
 def _looks_other(old: PosedFrame, new: PosedFrame, before: Layout, after: Layout) -> bool:

@@ -14,8 +14,10 @@ from workers.app import CLAIM_TTL_S, Stopwatch, db, log, settings, stage, store
 from workers.pictures import Quarters, put_tile
 
 quarters = Quarters(store, settings.photo_cache_bytes // 8)
-ENOUGH = 64
-"""Tiles that are worth a revision of their own while a final map is drawn."""
+ENOUGH, ENOUGH_LIVE = 64, 24
+"""Tiles that are worth a revision of their own while others are still drawn: every revision has its price,
+the overviews up to the top.
+"""
 
 
 @stage("publish")
@@ -30,9 +32,10 @@ def publish(mission_id: str) -> None:
             desk = backlog.of(tx, mission_id, CLAIM_TTL_S)
         if not pending or mission.zoom is None:
             break
-        more = desk.to_render + desk.in_flight > 0
-        if mission.state == "finalising" and more and len(pending) < ENOUGH:
-            break
+        final = mission.final_generation is not None
+        more = desk.in_flight + (desk.to_render if final else 0) > 0
+        if more and len(pending) < (ENOUGH if final else ENOUGH_LIVE):
+            break  # whoever draws the last of them wakes us
         changes = _with_overviews(mission_id, mission.zoom, pending, bounds)
         try:
             with db.write() as tx:

@@ -15,6 +15,7 @@ from core.ties import Canonical, canonical
 from services.catalog import backlog, frames, missions, pairs, poses, surveys, tiles
 from services.catalog.backlog import Backlog
 from services.catalog.pairs import Key as PairKey
+from services.catalog.poses import PoseUpdate
 from services.catalog.tiles import Key as TileId
 from services.queue import send
 from services.tables import Mission
@@ -22,20 +23,25 @@ from workers import surveyed, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
 from workers.lease import held
 from workers.photos import Pixels, shelf
-from workers.posing import Known, changed, everything, joined, update_of
+from workers.posing import DEFERRED, Known, changed, everything, joined, update_of
 
-GROWTH = 1.5
+GROWTH = 2.0
 """All poses are solved again when the mission has grown so many times since the last time."""
 MERGE_GROWTH = 1.02
 """When new frames tie submaps that were apart, so much is enough."""
 FEW = 8
 ASK_AGAIN_S = 60.0
-LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 8, 16, 24
+LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 12, 16, 24
+WORTH_A_LOOK = 24
+"""While so many photos still wait to be read, a mission that is being finished grows live as well."""
+REST_S = 1.5
+"""Pause between live renders while photos wait to be read: the map grows, and takes little from reading."""
 _REMEMBERED = 8
 
 _known: dict[str, Known] = {}
 _asked: dict[tuple[str, PairKey], float] = {}
 _come_back: dict[str, float] = {}
+_rested: dict[str, float] = {}
 
 
 before_the_fork(warmup.solving)
@@ -73,11 +79,13 @@ def _step(mission_id: str, epoch: int) -> bool:
         new = frames.list(tx, mission_id, "matched", limit=10_000) if desk.matched else []
     if mission.state == "finalising" and not desk.unread and (new or mission.final_generation is None):
         return _solve_finally(mission, epoch)
-    if new and mission.state != "finalising":
+    if new and (mission.state != "finalising" or desk.unread >= WORTH_A_LOOK):
         _pose(mission, epoch, {f.id for f in new})
         return True
     if desk.to_render:
         return _dispatch(mission, desk)
+    if mission.state == "open" and desk == Backlog(0, 0, 0, 0, 0) and _catch_up(mission, epoch):
+        return True
     if desk.to_publish and not desk.in_flight:
         send("publish", mission_id)  # normally the fuse task has: it may have died in between
         return False
@@ -137,9 +145,12 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
         after = joined(before, found, new_ids, known.camera_keys)
         dirty = changed(before, after)
         update = update_of(after, known.camera_keys, new_ids)
+    later = {tile for tile, priority in dirty.items() if priority == DEFERRED}
+    now = {tile: priority for tile, priority in dirty.items() if tile not in later}
     with db.write() as tx:
-        generation = poses.save(tx, mission.id, epoch, replace(update, dirty=dirty))
+        generation = poses.save(tx, mission.id, epoch, replace(update, dirty=now))
         clock.spend(tx, mission.id, "pose")
+    known.deferred = (known.deferred | later) - now.keys()
     known.layout, known.generation = after, generation
     log.info("posed", mission=mission.id, new=len(new_ids), posed=len(after.frames), dirty=len(dirty))
 
@@ -149,6 +160,18 @@ def _enough(known: Known, new_ids: set[str], matches: Sequence[PairMatch]) -> fl
     placed = known.layout.frames if known.layout else {}
     merged = {k: f.pose.submap for k, f in placed.items() if f.pose.source != "gnss"}
     return (MERGE_GROWTH if joins(merged, new_ids, matches) else GROWTH) * known.solved_frames
+
+
+def _catch_up(mission: Mission, epoch: int) -> bool:
+    """Nothing else is to be done: render what was put off. If this process dies before, finalising will."""
+    known = _known.get(mission.id)
+    if known is None or known.generation != mission.generation or not known.deferred:
+        return False
+    with db.write() as tx:
+        update = PoseUpdate(dirty=dict.fromkeys(known.deferred, DEFERRED))
+        known.generation = poses.save(tx, mission.id, epoch, update)
+    known.deferred = set()
+    return True
 
 
 def _solve_all(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:
@@ -249,13 +272,17 @@ def _all_matched(mission_id: str, wanted: set[PairKey]) -> bool:
 def _dispatch(mission: Mission, desk: Backlog) -> bool:
     """Hand out tiles, as many at a time as there are workers; one task while photos still wait to be read."""
     busy = desk.unread > settings.workers
-    size = LIVE_TILES if mission.state == "open" else FINAL_TILES
+    size = LIVE_TILES if mission.final_generation is None else FINAL_TILES
     room = size * (1 if busy else settings.workers) - desk.in_flight
-    if room <= 0:
+    now = time.monotonic()
+    if room <= 0 or (busy and now < _rested.get(mission.id, 0.0)):
         return False
+    _rested[mission.id] = now + REST_S
     with db.write() as tx:
         claimed = tiles.claim_dirty(tx, mission.id, room, CLAIM_TTL_S)
     keys = [(d.z, d.x, d.y) for d in claimed]
+    if not busy:  # few tiles are shared out evenly, so that they are there soon
+        size = min(size, max(4, -(-len(keys) // settings.workers)))
     for start in range(0, len(keys), size):
         send("fuse", mission.id, keys[start : start + size])
     return False
