@@ -24,6 +24,8 @@ ComplexArray = NDArray[np.complex128]
 # Tilt and relief move points by a few per cent of the height: what a similarity cannot explain.
 MODEL_ERROR = 0.03
 POINTS_WORTH = 4.0
+# How well scale and heading are known after chaining, as a share.
+CHAINED = 0.03
 ROUNDS = 8
 MIN_ROUNDS = 3
 SETTLED = 0.003
@@ -76,6 +78,16 @@ def moments(first: ComplexArray, second: ComplexArray, starts: IntArray) -> Mome
     )
 
 
+def ratios(m: Moments) -> tuple[ComplexArray, Array]:
+    """z_i / z_j of each pair (E,), and how widely its points spread (E,)."""
+    first = m.first[:, 0, 2] - 1j * m.first[:, 1, 2]
+    second = m.second[:, 0, 2] - 1j * m.second[:, 1, 2]
+    common = m.mixed[:, 0, 0] + 1j * m.mixed[:, 1, 0] - np.conj(first) * second
+    wide_i = np.maximum(m.first[:, 0, 0] - np.abs(first) ** 2, 1e-9)
+    wide_j = np.maximum(m.second[:, 0, 0] - np.abs(second) ** 2, 1e-9)
+    return np.sqrt(wide_j / wide_i) * np.exp(1j * np.angle(common)), np.sqrt(wide_i * wide_j)
+
+
 def average(
     pairs: IntArray,
     m: Moments,
@@ -83,8 +95,11 @@ def average(
     gps_sigma: Array,
     roots: NDArray[np.int64],
     height_m: float,
+    expected: ComplexArray,
 ) -> Similarities:
     """The robust least-squares similarities of all frames.
+
+    `expected`: (N,) z that `ratios` chained up from the root, NaN where GPS holds the scale instead.
 
     `gps`: (N,) complex metres, NaN where there is none; `gps_sigma` (N,). `roots`: frames held at z =
     `height_m`, c = 0, one in each component that GPS does not hold. `height_m`: a guess; only the weight of
@@ -96,6 +111,8 @@ def average(
     height = np.full(n, height_m)
     x, error = np.zeros((n, 4)), np.zeros(len(pairs))
     fronts = plan(n, pairs)
+    chained = np.isfinite(expected)
+    trust = np.where(chained, 1 / (CHAINED * np.maximum(np.abs(expected), 1e-3)) ** 2, 0.0)
     for turn in range(ROUNDS):
         w = edge_weight * POINTS_WORTH / (MODEL_ERROR * np.sqrt(height[i] * height[j])) ** 2
         H, g = np.zeros((n, 4, 4)), np.zeros((n, 4))
@@ -105,6 +122,10 @@ def average(
         H[:, 2, 2] += wg
         H[:, 3, 3] += wg
         g[known, 2], g[known, 3] = (wg * gps.real)[known], (wg * gps.imag)[known]
+        H[:, 0, 0] += trust
+        H[:, 1, 1] += trust
+        g[chained, 0] = (trust * expected.real)[chained]
+        g[chained, 1] = (trust * expected.imag)[chained]
         H[roots] += np.eye(4) * 1e3
         g[roots, 0] += 1e3 * height_m
         H += np.eye(4) * 1e-9

@@ -66,7 +66,7 @@ def plan(n: int, pairs: IntArray) -> tuple[Front, ...]:
 
 def _order(n: int, pairs: IntArray) -> IntArray:
     """Frames in the order in which they are eliminated."""
-    if n <= SMALL:
+    if n <= SMALL or not len(pairs):
         return np.arange(n)
     graph = gtsam.SymbolicFactorGraph()
     for i, j in pairs.tolist():

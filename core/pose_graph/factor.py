@@ -32,7 +32,7 @@ class Border:
 
 @dataclass(frozen=True, slots=True)
 class Factor:
-    """`lower` (p, p) and `below` (s, p) of each front: H = L·Lᵀ in the fronts' order; `d` unknowns a frame."""
+    """`lower` (p, p) and `below` (s, p) of each front: H = L·Lᵀ in their order; `d` unknowns a frame."""
 
     fronts: tuple[Front, ...]
     lower: tuple[Array, ...]
@@ -148,7 +148,7 @@ def covariances(fronts: tuple[Front, ...], frame: Array, pair: Array, border: Bo
     if dpotrf(schur, lower=1)[1] != 0:
         return None
     shared = np.einsum("nda,ab,neb->nde", spread, np.linalg.inv(schur), spread)
-    return _diagonal_of_inverse(factor, len(frame)) + shared
+    return np.asarray(_diagonal_of_inverse(factor, len(frame)) + shared)
 
 
 def _diagonal_of_inverse(factor: Factor, n: int) -> Array:

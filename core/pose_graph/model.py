@@ -30,7 +30,9 @@ class PoseParams:
     this many standard deviations (and this many times the median edge) is taken for a wrong match.
     `…_start_…`: before a mission shows how good its GPS and gimbal are; `…_floor_…`: the best that is
     believed of them afterwards. `min_downward`: cosine of the steepest tilt by the gimbal that still makes a
-    map photo; `oblique_ratio`: the furthest corner, in heights.
+    map photo; `oblique_ratio`: the furthest corner, in heights. Without GPS the scale comes from the first
+    frame (Avola 2019, 2.1): `first_height_m` above ground, or `ground_px_per_m`, pixels per metre of ground
+    as a marker of known size shows them.
     """
 
     points_per_edge: int = 32
@@ -59,6 +61,9 @@ class PoseParams:
     k2_sigma: float = 0.03
     lag_sigma_s: float = 0.3
     assumed_height_m: float = 60.0
+    first_height_m: float | None = None
+    ground_px_per_m: float | None = None
+    first_height_log_sigma: float = 0.01
     far_m: float = 50_000.0
     oblique_ratio: float = 10.0
     min_downward: float = 0.4

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from core.geometry import Array, Camera, Pose
 from core.matching import PairMatch
@@ -18,7 +21,7 @@ from core.pose_graph.model import GraphFrame, PoseParams, Solution
 from core.pose_graph.priors import Priors, gravity, heading
 from core.pose_graph.residuals import Edges, State
 from core.pose_graph.start import believed_gimbal, expected_down, yaw_offsets
-from core.pose_graph.survey import Survey, capture_order, survey
+from core.pose_graph.survey import Survey, capture_order, survey, usable_fix
 
 Flags = NDArray[np.bool_]
 
@@ -60,12 +63,14 @@ def place(
             if m.accepted and m.low in known and m.high in known:
                 ties[end].append(m)
     poses = {k: p for k, p in solution.poses.items() if k not in ties}
+    near = _Surroundings(known, replace(solution, poses=poses))
     cameras = dict(solution.cameras)
     unplaced = {k: v for k, v in solution.unplaced.items() if k not in ties}
     for frame_id in new:
         meta = known[frame_id].meta
         cameras.setdefault(meta.camera_key, meta.camera())
-        pose = _pose(replace(solution, cameras=cameras, poses=poses), known, frame_id, ties[frame_id], params)
+        now = replace(solution, cameras=cameras, poses=poses)
+        pose = _pose(now, known, near, frame_id, ties[frame_id], params)
         if isinstance(pose, str):
             unplaced[frame_id] = pose
         else:
@@ -75,22 +80,26 @@ def place(
 
 
 def _pose(
-    solution: Solution, known: dict[str, GraphFrame], frame_id: str, ties: list[PairMatch], params: PoseParams
+    solution: Solution,
+    known: dict[str, GraphFrame],
+    near: _Surroundings,
+    frame_id: str,
+    ties: list[PairMatch],
+    params: PoseParams,
 ) -> Pose | str:
     """The frame's pose, or why it has none."""
     partners = {m.low if m.high == frame_id else m.high for m in ties}
     seen = sorted(k for k in partners if k in solution.poses and solution.poses[k].source != "gnss")[
         :NEIGHBOURS
     ]
-    around = _around(known, frame_id, solution, params)
-    s = survey([known[k] for k in {frame_id, *seen, *around}], params, solution.world)
-    me = next(k for k, f in enumerate(s.frames) if f.frame_id == frame_id)
+    s, me = _survey(known, frame_id, {*seen, *_beside(known, frame_id, partners)}, solution, params)
     camera = solution.cameras[known[frame_id].meta.camera_key]
     down, trusted = expected_down(s)
     if trusted[me] and down[me, 2] < params.min_downward:
         return "oblique"
     pose = _visual(solution, s, me, set(seen), ties, params) if seen else None
     if pose is None:
+        s, me = _survey(known, frame_id, near.of(known[frame_id]), solution, params)
         offset = _offset(solution, s)
         pose = gnss_poses(s, np.array([me]), solution.poses, offset, params).get(me)
     if pose is None:
@@ -98,26 +107,56 @@ def _pose(
     return "oblique" if is_oblique(pose, camera, params.oblique_ratio) else pose
 
 
-def _around(known: dict[str, GraphFrame], frame_id: str, solution: Solution, params: PoseParams) -> set[str]:
-    """The same drone's frames just before and after, for speed and heading, and the nearest posed ones."""
+def _survey(
+    known: dict[str, GraphFrame], frame_id: str, others: set[str], solution: Solution, params: PoseParams
+) -> tuple[Survey, int]:
+    """A frame among some others, and its row."""
+    s = survey([known[k] for k in {frame_id, *others}], params, solution.world)
+    return s, next(k for k, f in enumerate(s.frames) if f.frame_id == frame_id)
+
+
+class _Surroundings:
+    """Who flew or lies near a frame that ties to nothing; made once it is asked, for all frames of a call."""
+
+    def __init__(self, known: dict[str, GraphFrame], solution: Solution) -> None:
+        self._known, self._solution = known, solution
+        self._visual = sorted(k for k, p in solution.poses.items() if p.source != "gnss" and k in known)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree([self._solution.poses[k].center[:2] for k in self._visual])
+
+    @cached_property
+    def _tracks(self) -> dict[str, list[GraphFrame]]:
+        tracks: dict[str, list[GraphFrame]] = {}
+        for f in sorted(self._known.values(), key=capture_order):
+            tracks.setdefault(f.meta.drone, []).append(f)
+        return tracks
+
+    def of(self, frame: GraphFrame) -> set[str]:
+        """The same drone's frames just before and after, for speed and heading; the nearest posed ones."""
+        track = self._tracks[frame.meta.drone]
+        at = bisect_left(track, capture_order(frame), key=capture_order)
+        out = {f.frame_id for f in (*track[max(at - 1, 0) : at], *track[at + 1 : at + 2])}
+        fix = usable_fix(frame.meta.gps)
+        if fix is None or not self._visual:
+            return out
+        here = self._solution.world.from_geodetic(
+            np.array([[fix.lon_deg, fix.lat_deg, self._solution.world.alt_m]])
+        )
+        _, near = self._tree.query(here[0, :2], k=min(5, len(self._visual)))
+        return out | {self._visual[int(k)] for k in np.atleast_1d(near)}
+
+
+def _beside(known: dict[str, GraphFrame], frame_id: str, partners: set[str]) -> set[str]:
+    """Of the frames it is matched with, the same drone's just before and after it: for speed and heading."""
     me = known[frame_id]
-    at = capture_order(me)
-    same = [f for f in known.values() if f.meta.drone == me.meta.drone and f.frame_id != frame_id]
-    before = max((f for f in same if capture_order(f) < at), key=capture_order, default=None)
-    after = min((f for f in same if capture_order(f) > at), key=capture_order, default=None)
-    out = {f.frame_id for f in (before, after) if f is not None}
-    if me.meta.gps is None:
-        return out
-    fix = np.array([[me.meta.gps.lon_deg, me.meta.gps.lat_deg, solution.world.alt_m]])
-    if not np.isfinite(fix).all():
-        return out
-    here = solution.world.from_geodetic(fix)[0, :2]
-    visual = [k for k, p in solution.poses.items() if p.source == "visual" and k in known]
-    if visual:
-        centres = np.array([solution.poses[k].center[:2] for k in visual])
-        near = np.lexsort((visual, np.hypot(*(centres - here).T)))[:5]
-        out |= {visual[k] for k in near.tolist()}
-    return out
+    same = sorted(
+        (known[k] for k in partners if k != frame_id and known[k].meta.drone == me.meta.drone),
+        key=capture_order,
+    )
+    at = bisect_left(same, capture_order(me), key=capture_order)
+    return {f.frame_id for f in same[max(at - 1, 0) : at + 1]}
 
 
 def _offset(solution: Solution, s: Survey) -> Array:
@@ -159,8 +198,13 @@ def _visual(
         return None
     others = [posed[k] for k in np.unique(edges.pairs) if k != me]
     first = min((p for p in others if p is not None), key=lambda p: p.submap)
+    sigmas = [p.sigma_m for p in others if p is not None and p.sigma_m is not None]
+    # as well as the worst known of the frames that it hangs on, until the next solve
+    certainty = (
+        (max(v[0] for v in sigmas), max(v[1] for v in sigmas), max(v[2] for v in sigmas)) if sigmas else None
+    )
     return Pose(
-        done.state.R[me], done.state.t[me], float(done.state.h[me]), first.source, first.submap, first.sigma_m
+        done.state.R[me], done.state.t[me], float(done.state.h[me]), first.source, first.submap, certainty
     )
 
 

@@ -219,7 +219,7 @@ FACTOR = np.stack([T[np.nonzero(T)] for T in SPREAD])
 
 
 def _gather(K: Array, source: IntArray, target: IntArray, factor: Array, H: Array, g: Array) -> None:
-    """Turn the products K (17, 17) of `_observe`'s columns into the pair's H (20, 20) and g (20), in place."""
+    """Turn the products K (17, 17) of `_observe`'s columns into the pair's H (20, 20) and g (20)."""
     for p in range(len(source)):
         row, a, fp = source[p], target[p], factor[p]
         g[a] -= fp * K[row, 16]

@@ -18,7 +18,7 @@ from core.pose_graph.matchgraph import edges_of, submaps
 from core.pose_graph.model import GraphFrame, PoseParams, Solution
 from core.pose_graph.priors import Priors, gravity, heading, nadir
 from core.pose_graph.residuals import Edges, IntArray, State
-from core.pose_graph.start import Start, expected_down, starting, yaw_offsets
+from core.pose_graph.start import Start, expected_down, first_of_known_height, starting, yaw_offsets
 from core.pose_graph.survey import Survey, capture_order, survey
 
 WILD = 10.0
@@ -87,7 +87,7 @@ def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
     ids = [f.frame_id for f in tied.frames]
     dropped = tuple((ids[i], ids[j]) for i, j in every.pairs.tolist() if (i, j) not in left)
     fine = replace(fine, steps=fine.steps + coarse.steps)
-    sigma_m = position_sigmas(fine, _origins(tied, edges.pairs, names))
+    sigma_m = position_sigmas(fine, priors, edges.pairs, _origins(tied, edges.pairs, names))
     return Graph(tied, rows, edges, fine, dropped, priors.gps_sigma, sigma, sigma_m)
 
 
@@ -129,6 +129,13 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
     k2 = np.full(c, params.k2_sigma)
     free = params.self_calibrate & (np.bincount(s.camera, minlength=c) >= params.min_frames_to_calibrate)
     lens_sigma = np.where(free[:, None], np.column_stack((focal, k1, k2)), 1e-6)
+    # of a whole submap, not of each frame: its frames share one start value
+    share = np.sqrt(np.bincount(submap)[submap])
+    height_sigma = np.where(loose, 0.1, 1.0) * share
+    first = first_of_known_height(s, params)
+    if first is not None and loose[first[0]]:
+        height_sigma[submap == submap[first[0]]] *= 10.0
+        height_sigma[first[0]] = params.first_height_log_sigma
     return Priors(
         gps=gps,
         gps_sigma=s.gps_sigma,
@@ -142,8 +149,7 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
         yaw=np.where(loose, yaw, np.nan),
         yaw_sigma=np.full(len(s), params.yaw_sigma_rad),
         height=start.height,
-        # of a whole submap, not of each frame: its frames share one start value
-        height_sigma=np.where(loose, 0.1, 1.0) * np.sqrt(np.bincount(submap)[submap]),
+        height_sigma=height_sigma,
         ground_step_sigma_m=params.ground_step_sigma_m,
         lens=start.state.lens,
         lens_sigma=lens_sigma,

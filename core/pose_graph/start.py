@@ -9,16 +9,19 @@ from numpy.typing import NDArray
 
 from core.geometry import Array
 from core.pose_graph.attitude import circular_mean, level_to_world, levelling, rotation_of
-from core.pose_graph.averaging import ComplexArray, Similarities, average, fit_similarity, moments
+from core.pose_graph.averaging import ComplexArray, Similarities, average, fit_similarity, moments, ratios
+from core.pose_graph.chaining import chained
 from core.pose_graph.matchgraph import flat_rays
 from core.pose_graph.model import PoseParams
 from core.pose_graph.priors import gravity
 from core.pose_graph.residuals import Edges, IntArray, State
-from core.pose_graph.survey import Survey
+from core.pose_graph.survey import Survey, capture_order
 
 # GPS holds a submap's scale and heading when it knows them better than this (share, radians).
 GPS_HOLDS = 0.15
 HORIZONTAL_RAD = -0.6
+# Where fewer frames (share) have GPS, it places a submap that pairs have shaped.
+WELL_COVERED = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,17 +63,23 @@ def starting(s: Survey, edges: Edges, submap: IntArray, params: PoseParams) -> S
     level = levelling(expected_down(s)[0])
     count = int(submap.max()) + 1
     held = np.array([_gps_holds(s, submap == k) for k in range(count)])
+    size = np.bincount(submap, minlength=count)
+    whole = held & (np.bincount(submap, s.has_gps, count) >= WELL_COVERED * size)
     degree = np.bincount(edges.pairs.ravel(), minlength=len(s))
     roots = [
-        int(np.flatnonzero(submap == k)[np.argmax(degree[submap == k])]) for k in range(count) if not held[k]
+        int(np.flatnonzero(submap == k)[np.argmax(degree[submap == k])]) for k in range(count) if not whole[k]
     ]
-    gps = np.where(held[submap] & s.has_gps, s.gps[:, 0] + 1j * s.gps[:, 1], np.nan)
+    gps = np.where(whole[submap] & s.has_gps, s.gps[:, 0] + 1j * s.gps[:, 1], np.nan)
     guess = _typical(s.relative_alt_m, params.assumed_height_m)
     first, second = flat_rays(edges, s.cameras, level)
-    averaged = average(
-        edges.pairs, moments(first, second, edges.starts), gps, s.gps_sigma, np.array(roots, np.int64), guess
-    )
-    placed, offset = _georeferenced(s, averaged, submap, held, params)
+    m = moments(first, second, edges.starts)
+    chain = np.full(len(s), np.nan, complex)
+    if roots:
+        z = guess * chained(edges.pairs, *ratios(m), roots, len(s))
+        chain[~whole[submap]] = z[~whole[submap]]
+    averaged = average(edges.pairs, m, gps, s.gps_sigma, np.array(roots, np.int64), guess, chain)
+    first_frame = first_of_known_height(s, params)
+    placed, offset = _georeferenced(s, averaged, submap, held, first_frame, params)
     height = np.abs(placed.z)
     expected = np.ones(len(s))
     ground = np.zeros(len(s))
@@ -82,11 +91,23 @@ def starting(s: Survey, edges: Edges, submap: IntArray, params: PoseParams) -> S
         altitude = s.gps[mine, 2] - height[mine]
         if np.isfinite(altitude).any():
             ground[mine] = np.nanmedian(altitude)
+    if first_frame is not None and not held[submap[first_frame[0]]]:
+        expected[first_frame[0]] = first_frame[1]
     centre = np.column_stack((placed.c.real, placed.c.imag, ground + height))
     lens = np.array([(c.f_px, c.k1, c.k2) for c in s.cameras])
     R = level_to_world(-np.angle(placed.z)) @ level
     state = State(R, centre, ground, lens, np.zeros(len(s.drones)))
     return Start(state, held, expected, averaged.error, offset)
+
+
+def first_of_known_height(s: Survey, params: PoseParams) -> tuple[int, float] | None:
+    """The first frame of the flight and its height above ground, metres, when that was given."""
+    first = min(range(len(s)), key=lambda k: capture_order(s.frames[k]))
+    if params.first_height_m is not None:
+        return first, params.first_height_m
+    if params.ground_px_per_m is not None:
+        return first, s.cameras[s.camera[first]].f_px / params.ground_px_per_m
+    return None
 
 
 def _gps_holds(s: Survey, mine: NDArray[np.bool_]) -> bool:
@@ -103,7 +124,12 @@ def _typical(values: Array, default: float) -> float:
 
 
 def _georeferenced(
-    s: Survey, a: Similarities, submap: IntArray, held: NDArray[np.bool_], params: PoseParams
+    s: Survey,
+    a: Similarities,
+    submap: IntArray,
+    held: NDArray[np.bool_],
+    first: tuple[int, float] | None,
+    params: PoseParams,
 ) -> tuple[Similarities, Array]:
     """Submaps brought to their place; yaw offset by drone as the submaps that GPS holds show it."""
     z, c = a.z.copy(), a.c.copy()
@@ -119,6 +145,8 @@ def _georeferenced(
     for k in np.flatnonzero(~held):
         mine = submap == k
         size = _typical(s.relative_alt_m[mine], mission) / max(float(np.median(np.abs(z[mine]))), 1e-6)
+        if first is not None and mine[first[0]]:
+            size = first[1] / max(float(np.abs(z[first[0]])), 1e-6)
         turn = size * np.exp(-1j * _turn(s, z, c, offset, mine))
         z[mine], c[mine] = turn * z[mine], turn * c[mine]
         seen = mine & s.has_gps
