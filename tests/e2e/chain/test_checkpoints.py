@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 from core.simulation import FlightParams, plan_flight
 from workers.simulate import simulate
 
+Run = Callable[..., tuple[str, dict[str, Any]]]
 BIAS = (3.0, -2.0)
 PARAMS = FlightParams(
     frames=12, drones=1, width_px=640, height_px=480, gps_noise_m=0.3, seed=6, monotony=0.0, cars=0
@@ -48,21 +50,29 @@ def gcp(photos: Path) -> Path:
     return path
 
 
-def run(photos: Path, out: Path, *options: str | Path) -> tuple[str, dict[str, Any]]:
-    done = subprocess.run(
-        [sys.executable, "-m", "services.cli", "run", str(photos), "--out", str(out), *map(str, options)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-        env={**os.environ, "COLUMNS": "200", "ORTHOSTREAM_WORKERS": "2"},
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout, json.loads((out / "report.json").read_text())
+@pytest.fixture
+def run(photos: Path, new_stack: Callable[..., Any]) -> Run:
+    """`orthostream run` on a server that is up already: what it says, and its report."""
+    url = new_stack().start().url
+
+    def run(out: Path, *options: str | Path) -> tuple[str, dict[str, Any]]:
+        command = ["run", str(photos), "--out", str(out), "--server", url, *map(str, options)]
+        done = subprocess.run(
+            [sys.executable, "-m", "services.cli", *command],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+            env={**os.environ, "COLUMNS": "200"},
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout, json.loads((out / "report.json").read_text())
+
+    return run
 
 
-def test_points_measure_the_map_and_chosen_ones_hold_it(photos: Path, gcp: Path, tmp_path: Path) -> None:
-    said, report = run(photos, tmp_path / "a", "--gcp", gcp)
+def test_points_measure_the_map_and_chosen_ones_hold_it(run: Run, gcp: Path, tmp_path: Path) -> None:
+    said, report = run(tmp_path / "a", "--gcp", gcp)
     assert "checkpoints, mosaic" in said
     checked = report["checkpoints"]
     assert [p["point"] for p in checked["points"]] == ["P0", "P1", "P2", "P3"]
@@ -72,7 +82,7 @@ def test_points_measure_the_map_and_chosen_ones_hold_it(photos: Path, gcp: Path,
     assert checked["mosaic"]["debiased_m"] < 0.6
     free = (tmp_path / "a" / "mosaic.tif").read_bytes()
 
-    said, report = run(photos, tmp_path / "a", "--gcp", gcp, "--use-gcp", "P0,P1,P3")
+    said, report = run(tmp_path / "a", "--gcp", gcp, "--use-gcp", "P0,P1,P3")
     assert "P0, P1, P3" in said
     held = report["checkpoints"]
     assert [p["point"] for p in held["points"] if p["used"]] == ["P0", "P1", "P3"]
@@ -81,6 +91,6 @@ def test_points_measure_the_map_and_chosen_ones_hold_it(photos: Path, gcp: Path,
     mosaic = (tmp_path / "a" / "mosaic.tif").read_bytes()
     assert mosaic != free
 
-    _, report = run(photos, tmp_path / "b", "--gcp", gcp, "--use-gcp", "P3", "--use-gcp", "P1,P0")
+    _, report = run(tmp_path / "b", "--gcp", gcp, "--use-gcp", "P3", "--use-gcp", "P1,P0")
     assert (tmp_path / "b" / "mosaic.tif").read_bytes() == mosaic
     assert report["checkpoints"] == held
