@@ -39,6 +39,10 @@ class SearchParams:
     margin: float = 0.05
     min_contrast: float = 2.0
 
+    def reach_px(self, grid: UtmGrid) -> int:
+        """How far a patch is moved, pixels of the mosaic."""
+        return min(self.max_radius_px, max(4, round(self.radius_m / grid.gsd_m)))
+
 
 DEFAULT = SearchParams()
 
@@ -95,17 +99,51 @@ def look_up(
     A patch of the photo around the pixel is drawn onto the mosaic's grid with the photo's pose, and moved to
     where it correlates best, to a fraction of a pixel.
     """
-    return [_look_up(o, world, grid, picture, photo(o.frame.frame_id), params) for o in seen]
+    groups: dict[str, list[int]] = {}
+    for k, o in enumerate(seen):
+        groups.setdefault(o.sighting.point, []).append(k)
+    found: dict[int, Lookup] = {}
+    for group in groups.values():
+        places = [_pixel(seen[k], world, grid) for k in group]
+        shown = _around(places, grid, picture, params)
+        for k, at in zip(group, places, strict=True):
+            found[k] = _look_up(seen[k], at, world, grid, shown, photo(seen[k].frame.frame_id), params)
+    return [found[k] for k in range(len(seen))]
+
+
+def _pixel(o: Observation, world: World, grid: UtmGrid) -> Array:
+    """Where the photo's own pose puts the point: (2,) column and row."""
+    cols, rows = grid.from_world(world, o.plane[None], o.frame.pose.ground_h_m)
+    return np.array([cols[0], rows[0]])
+
+
+def _around(places: Sequence[Array], grid: UtmGrid, picture: Picture, p: SearchParams) -> Picture:
+    """The picture, drawn but once where the windows of one point's photos overlap: pixels are absolute."""
+    side = p.reach_px(grid) + p.half_px
+    low = np.rint(np.min(places, axis=0)).astype(int) - side
+    size = np.rint(np.max(places, axis=0)).astype(int) + side + 1 - low
+    if (size > 4 * side).any():
+        return picture
+    whole = picture(grid.window(int(low[0]), int(low[1]), int(size[0]), int(size[1])))
+
+    def cut(window: UtmGrid) -> NDArray[np.uint8]:
+        top, left = window.row0 - int(low[1]), window.col0 - int(low[0])
+        return np.ascontiguousarray(whole[top : top + window.height, left : left + window.width])
+
+    return cut
 
 
 def _look_up(
-    o: Observation, world: World, grid: UtmGrid, picture: Picture, photo: NDArray[np.uint8], p: SearchParams
+    o: Observation,
+    at: Array,
+    world: World,
+    grid: UtmGrid,
+    picture: Picture,
+    photo: NDArray[np.uint8],
+    p: SearchParams,
 ) -> Lookup:
-    name = o.sighting.point
-    cols, rows = grid.from_world(world, o.plane[None], o.frame.pose.ground_h_m)
-    at = np.array([cols[0], rows[0]])
+    name, reach = o.sighting.point, p.reach_px(grid)
     middle = np.rint(at).astype(int)
-    reach = min(p.max_radius_px, max(4, round(p.radius_m / grid.gsd_m)))
     patch, inside = _patch(o, world, grid, photo, middle, p.half_px)
     if inside[p.half_px, p.half_px] == 0 or inside.mean() < 0.5:
         return Lookup(name, "outside")
