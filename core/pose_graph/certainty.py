@@ -21,10 +21,10 @@ FIXED_M, FIXED_RAD = 1e-3, 1e-5
 def position_sigmas(adjusted: Adjusted, priors: Priors, pairs: IntArray, origins: IntArray) -> Array:
     """Standard deviations (N, 3) of the frames' centres, east, north and up, metres; NaN where unknown.
 
-    `origins`: frames whose place, ground and heading are a convention (one in each submap without GPS):
-    positions of their submap are relative to them. The marginals are scaled by the unit variance that the residuals show,
-    where matches are worse than believed; what hills do to level planes is added as GPS shows it. An error
-    that all fixes of a flight share (a receiver's bias, a datum of its heights) is not in it.
+    `origins`: frames whose place, ground and heading are a convention (one in each submap without GPS): that
+    submap's positions are relative to them. The marginals are scaled by the unit variance that the residuals
+    show, where matches are worse than believed; what hills do to level planes is added as GPS shows it. An
+    error that all fixes of a flight share (a receiver's bias, a datum of its heights) is not in it.
     """
     normal, state = adjusted.normal, adjusted.state
     frame = normal.frame.copy()

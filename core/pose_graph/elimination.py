@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from core.pose_graph.residuals import IntArray
 
@@ -68,11 +70,26 @@ def _order(n: int, pairs: IntArray) -> IntArray:
     """Frames in the order in which they are eliminated."""
     if n <= SMALL or not len(pairs):
         return np.arange(n)
+    ones = np.ones(len(pairs), np.int8)
+    _, part = connected_components(coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (n, n)), directed=False)
+    by_part = np.argsort(part, kind="stable")
+    members = np.split(by_part, np.flatnonzero(np.diff(part[by_part])) + 1)
+    own, of_pair = np.empty(n, np.int64), part[pairs[:, 0]]
+    ordered = []
+    for mine in members:
+        own[mine] = np.arange(len(mine))
+        inside = own[pairs[of_pair == part[mine[0]]]] if len(mine) > SMALL else pairs[:0]
+        ordered.append(mine[_dissected(len(mine), inside)])
+    return np.concatenate(ordered)
+
+
+def _dissected(n: int, pairs: IntArray) -> IntArray:
+    """The order by METIS, which wants a connected graph: it crashes on a node without neighbours."""
+    if n <= SMALL:
+        return np.arange(n)
     graph = gtsam.SymbolicFactorGraph()
     for i, j in pairs.tolist():
         graph.push_factor(i, j)
-    for k in np.setdiff1d(np.arange(n), pairs).tolist():
-        graph.push_factor(k)
     found = gtsam.Ordering.MetisSymbolicFactorGraph(graph)
     return np.array([found.at(k) for k in range(n)], np.int64)
 
