@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from core.decode import decode_rgb
 from core.errors import RejectedFrame
 from core.features import FeatureParams, Features, extract
@@ -9,6 +12,7 @@ from core.frame import FrameMeta
 from core.metadata import read_metadata
 from core.photo import probe
 from services.catalog import frames
+from services.errors import OutOfDisk
 from services.queue import send
 from services.tables import Frame
 from workers.app import MAX_ATTEMPTS, Stopwatch, db, log, settings, stage, store
@@ -33,20 +37,35 @@ def ingest(mission_id: str, frame_id: str) -> None:
     if frame.state == "received":
         with db.write() as tx:
             attempts = frames.begin(tx, mission_id, frame_id)  # counts also those that end in a crash
+        if attempts > MAX_ATTEMPTS:
+            _put_off(mission_id, frame_id, attempts, Unreadable())
+            return
+        with _uncounted(mission_id, frame_id):
+            data = store.get(photo_key(mission_id, frame_id))
         try:
-            if attempts > MAX_ATTEMPTS:
-                raise Unreadable
-            meta, features = read(store.get(photo_key(mission_id, frame_id)), frame)
+            meta, features = read(data, frame)
         except Exception as error:
             _put_off(mission_id, frame_id, attempts, error)
             return
-        store.put(features_key(mission_id, frame_id), features.to_bytes())
+        with _uncounted(mission_id, frame_id):
+            store.put(features_key(mission_id, frame_id), features.to_bytes())
         with db.write() as tx:
             if frames.mark_ready(tx, mission_id, frame_id, meta):
                 clock.spend(tx, mission_id, "ingest")
     elif frame.state != "ready":
         return
     send("match", mission_id, frame_id)
+
+
+@contextmanager
+def _uncounted(mission_id: str, frame_id: str) -> Iterator[None]:
+    """A store that is full or away is no fault of the photo's: it waits for as long as that takes."""
+    try:
+        yield
+    except (OSError, OutOfDisk):
+        with db.write() as tx:
+            frames.forgive(tx, mission_id, frame_id)
+        raise
 
 
 def read(data: bytes, frame: Frame) -> tuple[FrameMeta, Features]:

@@ -116,6 +116,13 @@ def begin(tx: Session, mission_id: str, frame_id: str) -> int:
     return count
 
 
+def forgive(tx: Session, mission_id: str, frame_id: str) -> None:
+    """Forget the attempts at reading the photo: they ended for a reason that is not the photo's."""
+    lock(tx, mission_id)
+    row = (Frame.mission_id == mission_id) & (Frame.id == frame_id)
+    tx.execute(update(Frame).where(row).values(attempts=0).execution_options(synchronize_session=False))
+
+
 def mark_ready(
     tx: Session, mission_id: str, frame_id: str, meta: FrameMeta, now: float | None = None
 ) -> bool:

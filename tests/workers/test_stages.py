@@ -12,7 +12,7 @@ from PIL import Image
 from core.errors import TruncatedImage
 from core.mosaic import Mosaic, build, frame_id_of
 from services.catalog import backlog, exports, frames, leases, missions, pairs, poses, tiles
-from services.errors import LeaseLost
+from services.errors import LeaseLost, OutOfDisk
 
 Tiles = dict[tuple[int, int, int], bytes]
 
@@ -124,6 +124,24 @@ def test_a_photo_that_fails_to_be_read_is_rejected_in_the_end(
         row = frames.list(tx, bench.mission_id)[0]
     assert (row.state, row.reason_code) == ("rejected", "internal")
     assert "no room" in (row.reason or "")
+
+
+def test_a_full_disk_costs_no_photo_however_long_it_lasts(
+    bench: Any, photos: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OutOfDisk
+
+    bench.upload(photos[:1])
+    frame_id = frame_id_of(photos[0][1])
+    with monkeypatch.context() as away:
+        away.setattr(type(bench.modules["app"].store), "put", full)
+        for _ in range(9):
+            with pytest.raises(OutOfDisk):
+                bench.modules["ingest"].ingest(bench.mission_id, frame_id)
+    assert bench.frame_states() == {photos[0][0]: "received"}
+    bench.drain()
+    assert bench.frame_states() == {photos[0][0]: "fused"}
 
 
 def test_a_torn_photo_is_rejected_at_once_and_the_mission_ends(
