@@ -9,7 +9,7 @@ from services.settings import get_settings
 
 
 def migrate() -> None:
-    """Bring the database that ORTHOSTREAM_DATABASE_URL names to the newest schema; the embedded one needs none."""
+    """Bring the database that ORTHOSTREAM_DATABASE_URL names to the newest schema."""
     database = Database(get_settings().database_url)
     database.upgrade()
     database.close()
