@@ -20,7 +20,7 @@ from core.pose_graph.residuals import IntArray
 
 ComplexArray = NDArray[np.complex128]
 
-ROUNDS = 6
+ROUNDS = 10
 # Log-scale and radians by which the similarities of good pairs differ.
 SPREAD = 0.03
 HELD = 1e6
@@ -36,7 +36,8 @@ def chained(
     fronts, robust = plan(n, pairs), weight / weight.max(initial=1e-12)
     i, j = pairs[:, 0], pairs[:, 1]
     for turn in range(ROUNDS):
-        bend = SPREAD * max(1.0, 16.0 * 0.4**turn)
+        # plain least squares at first: a wrong pair that a tree went through loses against all around it
+        bend = SPREAD * max(1.0, 100.0 * 0.4**turn)
         miss = np.log(ratio * np.exp(x[j] - x[i]))
         w = robust / (1 + np.abs(miss / bend) ** 2) ** 2
         H, g = np.zeros((n, 2, 2)), np.zeros((n, 2))

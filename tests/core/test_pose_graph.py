@@ -14,7 +14,7 @@ import pytest
 from core.frame import Attitude, FrameMeta, GpsFix
 from core.geometry import Camera, World
 from core.matching import MatchCounts, PairMatch
-from core.pose_graph import GraphFrame, Solution, place, solve
+from core.pose_graph import GraphFrame, PoseParams, Solution, place, solve
 from core.pose_graph.attitude import rotation_of
 
 WORLD = World(46.2, 7.1, 400.0)
@@ -420,3 +420,126 @@ def test_a_new_frame_that_ties_to_nothing_falls_back_or_is_refused() -> None:
     placed = place(base, frames, [frames[40].frame_id, blind.frame_id], [])
     assert placed.poses[frames[40].frame_id].source == "gnss"
     assert placed.unplaced[blind.frame_id] == "not_placeable"
+
+
+def center_errors(flight: Flight, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the visual frames' centres and their stated sigmas, (N, 3) metres."""
+    truth = solution.world.from_geodetic(WORLD.to_geodetic(flight.centers))
+    rows = [k for k, f in enumerate(flight.frames) if solution.poses[f.frame_id].source == "visual"]
+    poses = [solution.poses[flight.frames[k].frame_id] for k in rows]
+    return np.array([p.center for p in poses]) - truth[rows], np.array([p.sigma_m for p in poses], float)
+
+
+@pytest.mark.parametrize(("relief_m", "gps_m"), [(0.0, 2.0), (0.0, 8.0), (10.0, 2.0), (30.0, 2.0)])
+def test_true_errors_lie_within_what_the_sigmas_allow(relief_m: float, gps_m: float) -> None:
+    both = [
+        center_errors(f, f.solve())
+        for f in (fly(relief_m=relief_m, gps_m=gps_m, seed=seed) for seed in range(5))
+    ]
+    in_sigmas = np.concatenate([error / sigma for error, sigma in both])
+    assert ((np.abs(in_sigmas) < 3).mean(0) >= 0.9).all()
+    # nor is it honest to say ten metres where it is one
+    assert (np.sqrt((in_sigmas**2).mean(0)) > 0.4).all()
+
+
+def test_better_gps_and_more_frames_are_known_better() -> None:
+    def typical(flight: Flight) -> np.ndarray:
+        return np.median(center_errors(flight, flight.solve())[1], axis=0)
+
+    assert (typical(fly(gps_m=8.0)) > 2 * typical(fly())).all()
+    assert (typical(fly(8, 25)) < 0.8 * typical(fly())).all()
+
+
+def without_gps(flight: Flight) -> Flight:
+    return flight.with_meta(lambda _, meta: replace(meta, gps=None))
+
+
+def route_errors(flight: Flight, solution: Solution) -> tuple[float, float, float]:
+    """Of the route's shape (RMS after a similarity, share of its length), its scale, and of heights."""
+    poses = [solution.poses[f.frame_id] for f in flight.frames]
+    a = np.array([p.center[:2] for p in poses]) @ (1, 1j)
+    b = flight.centers[:, :2] @ (1, 1j)
+    a, b = a - a.mean(), b - b.mean()
+    z = np.vdot(a, b) / np.vdot(a, a).real
+    height = np.array([p.center[2] - p.ground_h_m for p in poses]) / flight.centers[:, 2]
+    rms = float(np.sqrt((np.abs(b - z * a) ** 2).mean()))
+    return rms / float(np.abs(np.diff(b)).sum()), float(abs(z)), float(np.sqrt(((height - 1) ** 2).mean()))
+
+
+@pytest.mark.parametrize("shape", [(4, 12), (8, 25), (1, 40)])
+@pytest.mark.parametrize("relief_m", [0.0, 2.0])
+@pytest.mark.parametrize("given", ["height", "marker"])
+def test_without_gps_a_first_height_gives_route_and_heights(
+    shape: tuple[int, int], relief_m: float, given: str
+) -> None:
+    flight = without_gps(fly(*shape, relief_m=relief_m))
+    height_m = float(flight.centers[0, 2])
+    known = PoseParams(first_height_m=height_m)
+    marker = PoseParams(ground_px_per_m=flight.camera.f_px / height_m)
+    solution = solve(flight.frames, flight.matches, known if given == "height" else marker)
+    assert sources(solution) == ["vision-only"]
+    shape_share, scale, height_share = route_errors(flight, solution)
+    assert shape_share < 0.01
+    assert scale == pytest.approx(1.0, abs=0.02)
+    assert height_share < 0.03
+
+
+def test_half_the_first_height_is_half_the_map() -> None:
+    flight = without_gps(fly())
+    scales = [
+        route_errors(flight, solve(flight.frames, flight.matches, PoseParams(first_height_m=h)))[1]
+        for h in (60.0, 30.0)
+    ]
+    assert scales[1] / scales[0] == pytest.approx(2.0, rel=0.02)
+
+
+def test_without_gps_sigmas_grow_with_the_distance_from_the_first_frame() -> None:
+    flight = without_gps(fly(1, 40))
+    solution = solve(flight.frames, flight.matches, PoseParams(first_height_m=60.0))
+    sigma = [solution.poses[f.frame_id].sigma_m for f in flight.frames]
+    across = np.array([np.hypot(s[0], s[1]) for s in sigma if s])
+    assert across[0] < 0.01
+    assert across[39] > across[20] > across[5] > 0
+    assert all(s and s[2] < 6 for s in sigma)  # heights above the first frame's ground
+
+
+def test_a_long_flight_without_gps_keeps_its_scale() -> None:
+    flight = without_gps(fly(12, 40))
+    shape_share, scale, height_share = route_errors(
+        flight, solve(flight.frames, flight.matches, PoseParams(first_height_m=float(flight.centers[0, 2])))
+    )
+    assert (shape_share < 0.001, height_share < 0.02) == (True, True)
+    assert scale == pytest.approx(1.0, abs=0.02)
+
+
+def test_gps_that_comes_halfway_places_what_was_flown_before() -> None:
+    flight = fly(8, 25)
+    half = flight.with_meta(lambda k, meta: replace(meta, gps=None) if k < 100 else meta)
+    solution = half.solve()
+    assert sources(solution) == ["visual"]
+    assert shape_error_m(half, solution)[0] < 0.05
+    assert ground_error_m(half, solution) < 2.5
+    sigma = center_errors(half, solution)[1]
+    assert (sigma[:20, :2].mean(0) > 1.1 * sigma[180:, :2].mean(0)).all()
+
+
+def test_frames_are_placed_in_a_map_without_gps() -> None:
+    flight = without_gps(fly()).with_meta(lambda _, m: replace(m, relative_alt_m=HEIGHT_M))
+    before, after = live(flight, 36)
+    assert sources(after) == ["vision-only"]
+    assert len(after.poses) == 48
+    assert all(after.poses[k] is p for k, p in before.poses.items())
+    assert route_errors(flight, after)[0] < 0.01
+    assert all(p.sigma_m for p in after.poses.values())
+
+
+def test_placing_looks_at_matched_frames_only() -> None:
+    flight = fly(8, 25)
+    base = solve(flight.frames[:190], flight.matches)
+    new = flight.frames[195].frame_id
+    ties = [m for m in flight.matches if new in (m.low, m.high)]
+    near = {new} | {m.low for m in ties} | {m.high for m in ties}
+    some = [f for f in flight.frames if f.frame_id in near]
+    fewer = place(replace(base, poses={k: p for k, p in base.poses.items() if k in near}), some, [new], ties)
+    whole = place(base, flight.frames, [new], ties)
+    assert whole.poses[new].center.tobytes() == fewer.poses[new].center.tobytes()
