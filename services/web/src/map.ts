@@ -42,7 +42,7 @@ function style(): StyleSpecification {
       { id: "background", type: "background", paint: { "background-color": BACKGROUND } },
       {
         id: "footprint-fill", type: "fill", source: "frames", filter: only("footprint"),
-        paint: { "fill-color": SOURCE_COLOUR, "fill-opacity": ["case", WAITING, 0.16, 0] },
+        paint: { "fill-color": SOURCE_COLOUR, "fill-opacity": ["case", WAITING, 0.06, 0] },
       },
       {
         id: "footprint-line", type: "line", source: "frames", filter: only("footprint"),
