@@ -34,7 +34,7 @@ ASK_AGAIN_S = 60.0
 LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 12, 16, 24
 WORTH_A_LOOK = 24
 """While so many photos still wait to be read, a mission that is being finished grows live as well."""
-REST_S = 1.5
+REST_S = 4.0
 """Pause between live renders while photos wait to be read: the map grows, and takes little from reading."""
 _REMEMBERED = 8
 
