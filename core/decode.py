@@ -35,6 +35,10 @@ def scaled_size(width: int, height: int, max_side: int | None) -> tuple[int, int
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
+MILD_SHRINK = 1.5
+"""Up to this ratio a picture is made smaller by interpolation: a sample's neighbours still cover its area."""
+
+
 def decode_rgb(data: bytes, max_side: int | None = None) -> Pixels:
     """JPEG or TIFF bytes → (H, W, 3) uint8 RGB of `scaled_size`, EXIF orientation ignored, alpha dropped.
 
@@ -64,7 +68,11 @@ def decode_gray(data: bytes, max_side: int | None = None) -> Pixels:
 def _fit(picture: Pixels, size: tuple[int, int]) -> Pixels:
     if (picture.shape[1], picture.shape[0]) == size:
         return np.ascontiguousarray(picture)
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    # Areas by odd ratios take longer than the decoding itself, and matter only where a picture shrinks much.
+    mild = picture.shape[1] < MILD_SHRINK * size[0]
+    return np.asarray(
+        cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR if mild else cv2.INTER_AREA), np.uint8
+    )
 
 
 def _jpeg_header(data: bytes) -> tuple[int, int, str]:

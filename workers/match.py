@@ -6,13 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 from core.matching import match_pair
-from core.neighbours import Sighting, candidates_of
+from core.neighbours import NeighbourParams, Sighting, candidates_of
 from services.catalog import frames, missions, pairs
 from services.catalog.frames import Seen
 from services.catalog.pairs import Key, PairResult
 from services.queue import send
 from workers.app import Stopwatch, db, stage
 from workers.photos import shelf
+
+LIVE = NeighbourParams(nearest=6, alike=2)
+"""While photos come in, a few neighbours each hold them; the final solve asks for the pairs that it wants."""
 
 
 @stage("match")
@@ -48,7 +51,7 @@ def sighting(mission_id: str, seen: Seen) -> Sighting:
 def neighbours(mission_id: str, seen: Mapping[str, Seen], frame_id: str) -> list[Key]:
     """The pairs of one frame with those that are there."""
     everyone = {k: sighting(mission_id, s) for k, s in seen.items()}
-    return candidates_of(everyone[frame_id], [s for k, s in everyone.items() if k != frame_id])
+    return candidates_of(everyone[frame_id], [s for k, s in everyone.items() if k != frame_id], LIVE)
 
 
 def computed(mission_id: str, seen: Mapping[str, Seen], pair: Key) -> PairResult:

@@ -14,7 +14,7 @@ from workers.app import CLAIM_TTL_S, Stopwatch, db, log, settings, stage, store
 from workers.pictures import Quarters, put_tile
 
 quarters = Quarters(store, settings.photo_cache_bytes // 8)
-ENOUGH, ENOUGH_LIVE = 64, 24
+ENOUGH, ENOUGH_LIVE = 128, 24
 """Tiles that are worth a revision of their own while others are still drawn: every revision has its price,
 the overviews up to the top.
 """

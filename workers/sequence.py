@@ -50,6 +50,8 @@ before_the_fork(warmup.solving)
 @stage("sequence")
 def sequence(mission_id: str) -> None:
     """Frames matched → posed, dirty tiles → fuse tasks, finalising → final."""
+    if not _waits(mission_id):
+        return
     with held(db, mission_id, settings.lease_ttl_s) as epoch:
         if epoch is None:
             _come_back_later(mission_id)
@@ -61,6 +63,17 @@ def sequence(mission_id: str) -> None:
         missed = backlog.of(tx, mission_id, CLAIM_TTL_S).matched > 0
     if missed:
         send("sequence", mission_id)
+
+
+def _waits(mission_id: str) -> bool:
+    """Whether there may be something to do: most wake-ups come while photos are still being read."""
+    with db.read() as tx:
+        mission = missions.get(tx, mission_id)
+        desk = backlog.of(tx, mission_id, CLAIM_TTL_S)
+    if mission.state == "finalising" and 0 < desk.unread < WORTH_A_LOOK:
+        return False  # the last of them wakes us
+    resting = desk.unread > settings.workers and time.monotonic() < _rested.get(mission_id, 0.0)
+    return not (resting and mission.state == "finalising")
 
 
 def _come_back_later(mission_id: str) -> None:
@@ -272,14 +285,15 @@ def _all_matched(mission_id: str, wanted: set[PairKey]) -> bool:
 def _dispatch(mission: Mission, desk: Backlog) -> bool:
     """Hand out tiles, as many at a time as there are workers; one task while photos still wait to be read."""
     busy = desk.unread > settings.workers
-    size = LIVE_TILES if mission.final_generation is None else FINAL_TILES
+    final = mission.final_generation is not None
+    size = FINAL_TILES if final else LIVE_TILES
     room = size * (1 if busy else settings.workers) - desk.in_flight
     now = time.monotonic()
     if room <= 0 or (busy and now < _rested.get(mission.id, 0.0)):
         return False
     _rested[mission.id] = now + REST_S
     with db.write() as tx:
-        claimed = tiles.claim_dirty(tx, mission.id, room, CLAIM_TTL_S)
+        claimed = tiles.claim_dirty(tx, mission.id, room, CLAIM_TTL_S, by_place=final)
     keys = [(d.z, d.x, d.y) for d in claimed]
     if not busy:  # few tiles are shared out evenly, so that they are there soon
         size = min(size, max(4, -(-len(keys) // settings.workers)))

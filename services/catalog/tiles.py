@@ -105,17 +105,25 @@ def mark_dirty(
 
 
 def claim_dirty(
-    tx: Session, mission_id: str, limit_tiles: int, ttl_s: float, now: float | None = None
+    tx: Session,
+    mission_id: str,
+    limit_tiles: int,
+    ttl_s: float,
+    now: float | None = None,
+    by_place: bool = False,
 ) -> Sequence[DirtyTile]:
     """Tiles to render now, best priority first, 2 × 2 siblings together; they are the caller's for `ttl_s`.
 
-    At most `limit_tiles`, or one block of siblings when the limit is smaller than that.
+    At most `limit_tiles`, or one block of siblings when the limit is smaller than that. Of equal priority,
+    the longest waiting come first; `by_place`: neighbours, which share their photos.
     """
     lock(tx, mission_id)
     now = clock(now)
     free = _claimable(mission_id, ttl_s, now)
     block = _block()
-    first = (func.min(DirtyTile.priority), func.min(DirtyTile.since), *block)
+    place = (func.min(DirtyTile.x.op(">>")(3)), func.min(DirtyTile.y.op(">>")(2)))
+    then = place if by_place else (func.min(DirtyTile.since),)
+    first = (func.min(DirtyTile.priority), *then, *block)
     query = select(*block, func.count()).where(free).group_by(*block).order_by(*first).limit(limit_tiles)
     chosen: list[Key] = []
     total = 0
