@@ -39,7 +39,7 @@ SEQUENCE_STAGES = ("workers.sequence",)
 # Big arrays come and go with every photo: taken from the heap instead of mmap they cost no page faults.
 _MEMORY = {
     "MALLOC_MMAP_THRESHOLD_": "33554432",
-    "MALLOC_TRIM_THRESHOLD_": "134217728",
+    "MALLOC_TRIM_THRESHOLD_": "67108864",
     "MALLOC_ARENA_MAX": "2",
 }
 # One thread per process: parallelism comes from processes, and results must not depend on thread counts.
