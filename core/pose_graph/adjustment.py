@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.geometry import Array
-from core.pose_graph.elimination import Front, plan
-from core.pose_graph.factor import Border, solve_blocks
+from core.pose_graph.elimination import Border, Structure, plan, solve_blocks
 from core.pose_graph.priors import Priors, add_priors
 from core.pose_graph.residuals import Edges, Normal, State, linearise, retract
 
@@ -22,11 +21,11 @@ FORESEEN = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Adjusted:
-    """The optimum: `state`, its normal equations, the fronts that eliminate them, linearisations done."""
+    """The optimum: `state`, its normal equations, how they are eliminated, linearisations done."""
 
     state: State
     normal: Normal
-    fronts: tuple[Front, ...]
+    structure: Structure
     steps: int
 
     @property
@@ -61,10 +60,10 @@ def adjust(
     """
     state, damping = start, 1e-4
     normal = normal_equations(edges, priors, state, sigma_px, scale)
-    fronts = plan(len(start.R), edges.pairs)
+    structure = plan(len(start.R), edges.pairs)
     done = 1
     while done < steps:
-        solved = _step(fronts, edges, normal, damping, held)
+        solved = _step(structure, edges, normal, damping, held)
         if solved is None:
             damping = max(damping * 10, 1e-4)
             done += 1
@@ -86,11 +85,11 @@ def adjust(
             damping = max(damping * 30, 1e-4)
             if damping > 1e4:
                 break
-    return Adjusted(state, normal, fronts, done)
+    return Adjusted(state, normal, structure, done)
 
 
 def _step(
-    fronts: tuple[Front, ...], edges: Edges, normal: Normal, damping: float, held: NDArray[np.bool_] | None
+    structure: Structure, edges: Edges, normal: Normal, damping: float, held: NDArray[np.bool_] | None
 ) -> tuple[Array, Array] | None:
     diagonal = np.arange(normal.frame.shape[1])
     frame, pair, cross, rhs = normal.frame.copy(), normal.pair, normal.cross, normal.frame_rhs
@@ -102,4 +101,4 @@ def _step(
         rhs, cross = np.where(held[:, None], 0.0, rhs), np.where(held[:, None, None], 0.0, cross)
         still = held[edges.pairs[:, 0]] | held[edges.pairs[:, 1]]
         pair = np.where(still[:, None, None], 0.0, pair)
-    return solve_blocks(fronts, frame, pair, rhs, Border(cross, border, normal.border_rhs))
+    return solve_blocks(structure, frame, pair, rhs, Border(cross, border, normal.border_rhs))

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.geometry import Array
-from core.pose_graph.elimination import plan
-from core.pose_graph.factor import solve_blocks
+from core.pose_graph.elimination import plan, solve_blocks
 from core.pose_graph.residuals import IntArray
 
 ComplexArray = NDArray[np.complex128]
@@ -110,7 +109,7 @@ def average(
     edge_weight, gps_weight = np.ones(len(pairs)), np.ones(n)
     height = np.full(n, height_m)
     x, error = np.zeros((n, 4)), np.zeros(len(pairs))
-    fronts = plan(n, pairs)
+    structure = plan(n, pairs)
     chained = np.isfinite(expected)
     trust = np.where(chained, 1 / (CHAINED * np.maximum(np.abs(expected), 1e-3)) ** 2, 0.0)
     for turn in range(ROUNDS):
@@ -129,7 +128,7 @@ def average(
         H[roots] += np.eye(4) * 1e3
         g[roots, 0] += 1e3 * height_m
         H += np.eye(4) * 1e-9
-        solved = solve_blocks(fronts, H, -w[:, None, None] * m.mixed, g)
+        solved = solve_blocks(structure, H, -w[:, None, None] * m.mixed, g)
         if solved is None:
             break
         x, _ = solved

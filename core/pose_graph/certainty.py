@@ -6,7 +6,8 @@ import numpy as np
 
 from core.geometry import Array
 from core.pose_graph.adjustment import Adjusted
-from core.pose_graph.factor import Border, covariances
+from core.pose_graph.elimination import Border
+from core.pose_graph.marginals import covariances
 from core.pose_graph.priors import Priors, yaw_jacobian
 from core.pose_graph.residuals import IntArray, State
 
@@ -35,7 +36,7 @@ def position_sigmas(adjusted: Adjusted, priors: Priors, pairs: IntArray, origins
         frame[k, 6, 6] += 1 / FIXED_M**2
         frame[k, :3, :3] += np.outer(turn, turn) / FIXED_RAD**2
     border = Border(normal.cross, normal.border, normal.border_rhs)
-    blocks = covariances(adjusted.fronts, frame, normal.pair, border)
+    blocks = covariances(adjusted.structure, frame, normal.pair, border)
     if blocks is None:
         return np.full((len(frame), 3), np.nan)
     unit = max(1.0, float(np.median(adjusted.squared)) / MEDIAN_2D**2) if adjusted.squared.size else 1.0

@@ -14,8 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order
 
 from core.geometry import Array
-from core.pose_graph.elimination import plan
-from core.pose_graph.factor import solve_blocks
+from core.pose_graph.elimination import plan, solve_blocks
 from core.pose_graph.residuals import IntArray
 
 ComplexArray = NDArray[np.complex128]
@@ -33,7 +32,7 @@ def chained(
     `ratio` (E,) of the pairs, robustly; `weight` (E,) orders the pairs by how well they are known.
     """
     x = _along_trees(pairs, ratio, weight, roots, n)
-    fronts, robust = plan(n, pairs), weight / weight.max(initial=1e-12)
+    structure, robust = plan(n, pairs), weight / weight.max(initial=1e-12)
     i, j = pairs[:, 0], pairs[:, 1]
     for turn in range(ROUNDS):
         # plain least squares at first: a wrong pair that a tree went through loses against all around it
@@ -47,7 +46,7 @@ def chained(
         pull = w[:, None] * np.column_stack((miss.real, miss.imag))
         np.add.at(g, i, pull)
         np.add.at(g, j, -pull)
-        solved = solve_blocks(fronts, H, -w[:, None, None] * np.eye(2), g)
+        solved = solve_blocks(structure, H, -w[:, None, None] * np.eye(2), g)
         if solved is None:
             break
         step = solved[0][:, 0] + 1j * solved[0][:, 1]

@@ -1,4 +1,4 @@
-"""The sparse factor against dense algebra on graphs of every kind."""
+"""The solution and the marginals of gtsam's elimination against dense algebra on graphs of every kind."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from core.pose_graph.chaining import chained
-from core.pose_graph.elimination import plan
-from core.pose_graph.factor import Border, covariances, solve_blocks
+from core.pose_graph.elimination import Border, eliminate, plan, solve_blocks
+from core.pose_graph.marginals import covariances
 
 D, SHARED = 3, 2
 
@@ -68,12 +68,12 @@ def system(n: int, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def test_solution_and_inverse_are_those_of_the_dense_matrix(name: str) -> None:
     n, pairs = GRAPHS[name][0], GRAPHS[name][1].astype(np.int64).copy()
     frame, pair, rhs, border, dense = system(n, pairs)
-    fronts = plan(n, pairs)
-    solved = solve_blocks(fronts, frame, pair, rhs, border)
+    structure = plan(n, pairs)
+    solved = solve_blocks(structure, frame, pair, rhs, border)
     expected = np.linalg.solve(dense, np.concatenate((rhs.ravel(), border.rhs)))
     assert solved is not None
     np.testing.assert_allclose(np.concatenate((solved[0].ravel(), solved[1])), expected, atol=1e-9)
-    blocks, inverse = covariances(fronts, frame, pair, border), np.linalg.inv(dense)
+    blocks, inverse = covariances(structure, frame, pair, border), np.linalg.inv(dense)
     assert blocks is not None
     for k in range(n):
         at = slice(k * D, k * D + D)
@@ -88,19 +88,33 @@ def test_what_is_not_positive_definite_has_no_solution() -> None:
     assert covariances(plan(n, pairs), frame, pair, border) is None
 
 
-def test_every_frame_is_eliminated_once_and_hands_on_to_a_later_front() -> None:
+def test_every_frame_is_eliminated_once() -> None:
     for n, pairs in GRAPHS.values():
-        fronts = plan(n, pairs.astype(np.int64))
-        gone = np.concatenate([f.nodes[: f.pivots] for f in fronts])
-        assert sorted(gone.tolist()) == list(range(n))
-        for k, front in enumerate(fronts):
-            assert (front.parent > k) == (len(front.nodes) > front.pivots)
+        assert sorted(plan(n, pairs.astype(np.int64)).order.tolist()) == list(range(n))
 
 
 def test_a_grid_stays_sparse() -> None:
     n, pairs = 30**2, grid(30).astype(np.int64)
-    entries = sum(len(f.nodes) * f.pivots for f in plan(n, pairs))
-    assert entries < 80 * n  # dense: n² / 2 = 450 n
+    frame, pair, rhs, border, _ = system(n, pairs)
+    done = eliminate(plan(n, pairs), frame, pair, rhs, border)
+    assert done is not None
+    entries, seen = 0, set()
+    for k in range(n):
+        conditional = done.tree[k].conditional()
+        if conditional.firstFrontalKey() not in seen:
+            seen.add(conditional.firstFrontalKey())
+            entries += conditional.R().size + conditional.S().size
+    assert entries < 80 * n * D**2  # dense: n² / 2 = 450 n
+
+
+def test_the_same_numbers_give_the_same_bits() -> None:
+    n, pairs = GRAPHS["grid"][0], GRAPHS["grid"][1].astype(np.int64).copy()
+    frame, pair, rhs, border, _ = system(n, pairs)
+    first, again = (solve_blocks(plan(n, pairs), frame, pair, rhs, border) for _ in range(2))
+    assert first is not None
+    assert again is not None
+    assert first[0].tobytes() == again[0].tobytes()
+    assert first[1].tobytes() == again[1].tobytes()
 
 
 def test_chained_scales_survive_wrong_pairs() -> None:
