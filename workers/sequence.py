@@ -30,7 +30,7 @@ GROWTH = 2.0
 MERGE_GROWTH = 1.02
 """When new frames tie submaps that were apart, so much is enough."""
 FEW = 8
-ASK_AGAIN_S = 60.0
+ASK_AGAIN_S = 10.0
 LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 12, 16, 24
 WORTH_A_LOOK = 24
 """While so many photos still wait to be read, a mission that is being finished grows live as well."""
