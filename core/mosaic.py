@@ -19,6 +19,7 @@ from core.features import FeatureParams, Features, extract
 from core.fusion import FrameIndex
 from core.geometry import Camera, Pose, PosedFrame, World
 from core.grid import TileKey
+from core.horizon import shows_sky
 from core.matching import PairMatch, match_pair
 from core.metadata import read_metadata
 from core.neighbours import Pair, Sighting
@@ -83,7 +84,10 @@ def lay_out(
     ]
     zoom = mission_zoom(bare, solution.world, max_side, zoom_now)
     under = {f.frame_id: tiles_under(f, solution.world, zoom) if zoom is not None else set() for f in bare}
-    good = [f for f in bare if 0 < len(under[f.frame_id]) <= MOST_TILES]
+    # A horizon shot fits nowhere; drawn by its GPS it would paint the sky beside the photos that do fit.
+    tied = any(f.pose.source != "gnss" for f in bare)
+    sky = {f.frame_id for f in bare if tied and f.pose.source == "gnss" and shows_sky(thumb(f.frame_id))}
+    good = [f for f in bare if 0 < len(under[f.frame_id]) <= MOST_TILES and f.frame_id not in sky]
     lit = balanced(good, solution.world, {f.frame_id: thumb(f.frame_id) for f in good})
     frames = {f.frame_id: replace(f, gain=_rgb(f.gain)) for f in lit}
     lost = {f.frame_id: "oblique" for f in bare} | dict(solution.unplaced)
