@@ -42,6 +42,10 @@ class FeatureParams:
     thumb_px: int = 128
 
 
+FEATURE_SIDE_PX = FeatureParams().side_px
+"""Keypoints are found on a copy of this size, so nothing larger is decoded for them."""
+
+
 @dataclass(frozen=True, slots=True)
 class Features:
     """The features of one photo.

@@ -15,7 +15,7 @@ from core.coverage import FUSION, blocks, draw_block, mission_zoom, pyramid, til
 from core.decode import Pixels, decode_rgb
 from core.errors import RejectedFrame
 from core.exposure import balanced
-from core.features import FeatureParams, Features, extract
+from core.features import FEATURE_SIDE_PX, Features, extract
 from core.fusion import FrameIndex
 from core.geometry import Camera, Pose, PosedFrame, World
 from core.grid import TileKey
@@ -28,8 +28,6 @@ from core.pose_graph import GraphFrame, Solution, solve
 from core.submaps import SubmapGraph, submap_graph
 from core.ties import Canonical, canonical
 
-FEATURE_SIDE_PX = FeatureParams().side_px
-"""Keypoints are found on a copy of this size, so nothing larger is decoded for them."""
 MOST_TILES = 4096
 """A frame that would cover more native tiles than this was posed so far off that it would bury the map."""
 

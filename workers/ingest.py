@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from core.decode import decode_rgb
 from core.errors import RejectedFrame
-from core.features import FeatureParams, Features, extract
+from core.features import FEATURE_SIDE_PX, Features, extract
 from core.frame import FrameMeta
 from core.metadata import read_metadata
 from core.photo import probe
@@ -17,9 +17,6 @@ from services.queue import send
 from services.tables import Frame
 from workers.app import MAX_ATTEMPTS, Stopwatch, db, log, settings, stage, store
 from workers.photos import features_key, photo_key
-
-# Keypoints are found on a copy of this size at most: decoding is cheaper when it stops there.
-FEATURE_SIDE_PX = FeatureParams().side_px
 
 
 class Unreadable(RejectedFrame):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.geometry import Array
+from core.geometry import Array, Camera, Pose, World
 from core.horizon import shows_sky
+from core.mosaic import lay_out
+from core.pose_graph import Solution
 from core.terrain import Terrain, TerrainParams
 
 
@@ -35,3 +37,18 @@ def test_ground_is_no_sky(gsd_m: float) -> None:
 @pytest.mark.parametrize("level", [0, 90, 250])
 def test_an_even_field_is_no_sky(level: int) -> None:
     assert not shows_sky(np.full((96, 128, 3), level, np.uint8))
+
+
+def test_only_a_photo_that_ties_to_nothing_is_left_out_for_its_sky() -> None:
+    down = np.diag([1.0, -1.0, -1.0])
+    poses = {
+        name: Pose(down, np.array([20.0 * k, 0.0, 60.0]), 0.0, source)
+        for k, (name, source) in enumerate({"tied": "visual", "untied": "gnss", "field": "gnss"}.items())
+    }
+    camera = Camera(640, 480, 400.0, 319.5, 239.5)
+    sky, ground = (p.clip(0, 255).astype(np.uint8) for p in (_horizon(), _ground()))
+    thumbs = {"tied": sky, "untied": sky, "field": ground}
+    solution = Solution(World(47.0, 15.0), {"c": camera}, poses, {}, 0.0)
+    layout = lay_out(solution, dict.fromkeys(poses, "c"), thumbs.__getitem__, None)
+    assert layout.frames.keys() == {"tied", "field"}
+    assert layout.rejected == {"untied": "oblique"}
