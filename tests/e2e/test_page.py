@@ -227,6 +227,18 @@ def test_photos_go_up_from_the_browser(page: Page, service: Service, tmp_path: P
     picture(page, "8-missions")
 
 
+def test_a_refusal_is_listed_though_its_event_never_comes(page: Page, service: Service, mission: Mission) -> None:
+    """The count may come with the mission's document before its event does."""
+    page.route("**/events*", lambda route: route.fulfill(content_type="text/event-stream", body=": nothing\n\n"))
+    page.goto(mission.url)
+    stat(page, "Rejected")("0")
+    with service.db.write() as tx:
+        frames.record_rejected_upload(tx, mission.mission_id, "b" * 32, "DJI_0043.JPG", 9, TruncatedImage())
+    stat(page, "Rejected")("1")
+    page.locator("summary", has_text="Rejected photos").click()
+    expect(page.locator("ul.rejected")).to_contain_text("DJI_0043.JPG")
+
+
 def test_finalising_and_downloads(page: Page, service: Service, mission: Mission, shots: list[Shot]) -> None:
     mission.fly(shots[:4])
     with service.db.write() as tx:

@@ -86,6 +86,7 @@ export class MissionPage {
   private mission: Mission;
   private readonly refreshFrames = throttled(() => this.loadFrames());
   private readonly refreshRejected = throttled(() => this.loadRejected());
+  private rejectedListed = 0;
   private readonly refreshExports = throttled(() => this.loadExports());
   private readonly refreshMission = throttled(() => this.loadMission());
 
@@ -109,7 +110,6 @@ export class MissionPage {
     Object.assign(window, { missionMap: this.map });
     this.show(mission);
     this.refreshFrames();
-    this.refreshRejected();
     this.listen();
   }
 
@@ -129,6 +129,7 @@ export class MissionPage {
   private show(mission: Mission): void {
     this.mission = mission;
     this.panel.setMission(mission);
+    this.listRejected();
     this.showEmpty();
     if (mission.zoom !== null) void this.map.showTiles(mission.zoom);
     this.refreshExports();
@@ -143,12 +144,11 @@ export class MissionPage {
       },
       frames: () => this.refreshFrames(),
       progress: (progress) => {
-        const rejected = this.mission.progress.counts.rejected !== progress.counts.rejected;
         if (progress.state !== this.mission.progress.state) this.refreshMission();
         this.mission.progress = progress;
         this.panel.setProgress(progress);
+        this.listRejected();
         this.showEmpty();
-        if (rejected) this.refreshRejected();
       },
       exports: () => this.refreshExports(),
       mission: () => this.refreshMission(),
@@ -174,9 +174,17 @@ export class MissionPage {
     void this.map.showFrames(frames);
   }
 
+  /** Against what the list shows, for a count comes with an event or with the mission's document, whichever is first. */
+  private listRejected(): void {
+    if (this.mission.progress.counts.rejected !== this.rejectedListed) this.refreshRejected();
+  }
+
   private async loadRejected(): Promise<void> {
+    const told = this.mission.progress.counts.rejected;
     const { frames } = await api.rejected(this.mission.id);
-    if (!this.gone) this.panel.setRejected(frames);
+    if (this.gone) return;
+    this.rejectedListed = told;
+    this.panel.setRejected(frames);
   }
 
   private async loadExports(): Promise<void> {
