@@ -232,6 +232,7 @@ def test_a_refusal_is_listed_though_its_event_never_comes(page: Page, service: S
     page.route("**/events*", lambda route: route.fulfill(content_type="text/event-stream", body=": nothing\n\n"))
     page.goto(mission.url)
     stat(page, "Rejected")("0")
+    page.wait_for_load_state("networkidle")
     with service.db.write() as tx:
         frames.record_rejected_upload(tx, mission.mission_id, "b" * 32, "DJI_0043.JPG", 9, TruncatedImage())
     stat(page, "Rejected")("1")
