@@ -11,50 +11,16 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import sqlite3
 import subprocess
 import sys
-import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import psutil
+from tests.bench.watch import watch
 
 PROGRAM = [str(Path(sys.executable).with_name("orthostream"))]
-
-
-def label(process: psutil.Process) -> str:
-    """What a process of the tree is, from its command line."""
-    line = " ".join(process.cmdline())
-    for word, name in (
-        ("valkey", "broker"),
-        ("uvicorn", "api"),
-        ("sequence", "sequencer"),
-        ("celery", "workers"),
-    ):
-        if word in line:
-            return name
-    return "cli"
-
-
-def watch(process: subprocess.Popen[bytes]) -> dict[str, Any]:
-    """Follows a process tree until its root ends: peak PSS in MB and CPU seconds by kind of process."""
-    peak, cpu = 0, dict[int, tuple[str, float]]()
-    root = psutil.Process(process.pid)
-    while process.poll() is None:
-        total = 0
-        try:
-            for member in [root, *root.children(recursive=True)]:
-                total += member.memory_full_info().pss
-                times = member.cpu_times()
-                cpu[member.pid] = (label(member), times.user + times.system)
-        except psutil.NoSuchProcess:
-            continue
-        peak = max(peak, total)
-        time.sleep(0.5)
-    seconds = dict[str, float]()
-    for name, spent in cpu.values():
-        seconds[name] = round(seconds.get(name, 0.0) + spent, 2)
-    return {"exit": process.returncode, "peak_pss_mb": round(peak / 1e6), "cpu_s": seconds}
 
 
 def scored(tools: Path | None, script: str, *arguments: Path | str) -> dict[str, Any]:
@@ -75,14 +41,41 @@ def run(photos: Path, out: Path, options: argparse.Namespace) -> dict[str, Any]:
     command += ["--pace", str(options.pace)] if options.pace else []
     gcp = photos.parent / "gcp_list.txt"
     command += ["--gcp", str(gcp)] if gcp.exists() else []
-    started = time.monotonic()
-    process = subprocess.Popen(["taskset", "-c", options.cores, *command], stdout=subprocess.DEVNULL)
-    figures = watch(process) | {"wall_s": round(time.monotonic() - started, 1)}
+    seen = watch(["taskset", "-c", options.cores, *command])
+    figures = {"exit": seen.exit, "wall_s": seen.wall_s, "peak_pss_mb": seen.peak_pss_mb}
     report = out / "report.json"
-    if report.exists():
-        figures["report"] = json.loads(report.read_text())
-        figures["report"].pop("rejected", None)
-    return figures
+    if not report.exists():
+        return figures | {"cpu_s": {"all": seen.cpu_s()}}
+    said = json.loads(report.read_text())
+    said.pop("rejected", None)
+    uploaded, shown = milestones(out)
+    cpu_s = {
+        "before_first_upload": seen.cpu_s(until=uploaded),
+        "until_last_tile": seen.cpu_s(uploaded, shown),
+        "exports": seen.cpu_s(since=shown),
+    }
+    return figures | {"cpu_s": cpu_s} | rates(photos, said, shown - uploaded) | {"report": said}
+
+
+def milestones(out: Path) -> tuple[float, float]:
+    """When the first photo came and when the last tile was shown: seconds since the epoch."""
+    with closing(sqlite3.connect(out / ".orthostream" / "orthostream.db")) as db:
+        query = "SELECT first_upload_at, last_tile_at FROM missions ORDER BY created_at DESC LIMIT 1"
+        first, last = db.execute(query).fetchone()
+    return float(first), float(last)
+
+
+def rates(photos: Path, report: dict[str, Any], seconds: float) -> dict[str, Any]:
+    """How fast the service was from the first upload to the last tile, and what a photo cost each stage."""
+    frames = max(report["frames"], 1)
+    size_mb = sum(p.stat().st_size for p in photos.rglob("*") if p.is_file()) / 1e6
+    budget = {name: round(1000 * s / frames, 1) for name, s in report["stage_seconds"].items()}
+    return {
+        "upload_to_last_tile_s": round(seconds, 2),
+        "frames_per_s": round(frames / seconds, 2),
+        "mb_per_s": round(size_mb / seconds, 2),
+        "stage_ms_a_frame": budget,
+    }
 
 
 def flight(photos: Path, options: argparse.Namespace) -> dict[str, Any]:
