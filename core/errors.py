@@ -96,6 +96,12 @@ class BadCheckpoints(OrthostreamError):
     code = "bad_checkpoints"
 
 
+class BadScale(OrthostreamError):
+    """What is said of the mission's scale makes no sense."""
+
+    code = "bad_scale"
+
+
 class BadCrs(OrthostreamError):
     """The coordinate reference system is not known. Name one such as EPSG:32632."""
 

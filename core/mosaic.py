@@ -6,14 +6,14 @@ Photos → metadata, features → neighbours → matches → poses → exposure 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 
 import numpy as np
 
 from core.coverage import FUSION, blocks, draw_block, mission_zoom, pyramid, tiles_under
 from core.decode import Pixels, decode_rgb
-from core.errors import RejectedFrame
+from core.errors import NotPlaceable, RejectedFrame
 from core.exposure import balanced
 from core.features import FEATURE_SIDE_PX, Features, extract
 from core.fusion import FrameIndex
@@ -24,7 +24,8 @@ from core.matching import PairMatch, match_pair
 from core.metadata import read_metadata
 from core.neighbours import Pair, Sighting
 from core.photo import probe
-from core.pose_graph import GraphFrame, Solution, solve
+from core.pose_graph import GraphFrame, PoseParams, Solution, solve
+from core.scale import UNKNOWN, KnownScale, named
 from core.submaps import SubmapGraph, submap_graph
 from core.ties import Canonical, canonical
 
@@ -36,7 +37,9 @@ MOST_TILES = 4096
 class Layout:
     """Everything that the tiles are drawn from, besides the photos. `under`: each frame's native tiles.
 
-    `rejected`: frame id → error code of `core.errors`.
+    `rejected`: frame id → error code of `core.errors`. `waiting`: frames without GPS that tie to nothing that
+    has a place, with the pose on their island (None for one that is alone); they are kept, and drawn when a
+    photo ties them in.
     """
 
     world: World
@@ -45,6 +48,7 @@ class Layout:
     frames: Mapping[str, PosedFrame]
     under: Mapping[str, frozenset[TileKey]]
     rejected: Mapping[str, str]
+    waiting: Mapping[str, Pose | None] = field(default_factory=dict)
 
     @property
     def cover(self) -> set[TileKey]:
@@ -74,6 +78,7 @@ def lay_out(
     thumb: Callable[[str], Pixels],
     max_side: int | None,
     zoom_now: int | None = None,
+    mode: str = "visual",
 ) -> Layout:
     """Where and how bright every posed frame is drawn. `zoom_now`: kept while it fits well enough."""
     bare = [
@@ -89,14 +94,22 @@ def lay_out(
     lit = balanced(good, solution.world, {f.frame_id: thumb(f.frame_id) for f in good})
     frames = {f.frame_id: replace(f, gain=_rgb(f.gain)) for f in lit}
     lost = {f.frame_id: "oblique" for f in bare} | dict(solution.unplaced)
+    waiting = waiting_frames(solution, mode)
     return Layout(
         world=solution.world,
         zoom=zoom,
         cameras=dict(solution.cameras) | {camera_keys[k]: f.camera for k, f in frames.items()},
         frames=frames,
         under={k: frozenset(under[k]) for k in frames},
-        rejected={k: code for k, code in lost.items() if k not in frames},
+        rejected={k: code for k, code in lost.items() if k not in frames and k not in waiting},
+        waiting=waiting,
     )
+
+
+def waiting_frames(solution: Solution, mode: str) -> dict[str, Pose | None]:
+    """The frames that wait for a tie, by id; in mode gnss nothing could ever tie one."""
+    lone = [k for k, code in solution.unplaced.items() if code == NotPlaceable.code]
+    return {k: solution.islands.get(k) for k in sorted(lone)} if mode == "visual" else {}
 
 
 def _plain(pose: Pose) -> Pose:
@@ -146,7 +159,12 @@ class _Photos:
         return self._read[frame_id].features.thumb
 
 
-def build(photos: Sequence[tuple[str, bytes]], max_side: int | None = None, mode: str = "visual") -> Mosaic:
+def build(
+    photos: Sequence[tuple[str, bytes]],
+    max_side: int | None = None,
+    mode: str = "visual",
+    scale: KnownScale = UNKNOWN,
+) -> Mosaic:
     """The map of some photos (name, bytes), whatever their order. `mode`: visual or gnss."""
     rejected: dict[str, str] = {}
     read: dict[str, _Read] = {}
@@ -166,18 +184,28 @@ def build(photos: Sequence[tuple[str, bytes]], max_side: int | None = None, mode
 
     wanted = canonical([r.sighting for r in read.values()] if mode == "visual" else [], matched)
     assert wanted is not None  # `matched` never puts off
-    solution, submaps = solved(frames, wanted)
+    solution, submaps = solved(frames, wanted, scale)
     camera_keys = {k: r.frame.meta.camera_key for k, r in read.items()}
-    layout = lay_out(solution, camera_keys, lambda k: read[k].features.thumb, max_side)
+    layout = lay_out(solution, camera_keys, lambda k: read[k].features.thumb, max_side, mode=mode)
     tiles = draw(layout, _Photos(read, max_side))
     return Mosaic(solution, layout, tiles, rejected | dict(layout.rejected), submaps)
 
 
-def solved(frames: Sequence[GraphFrame], pairs: Canonical) -> tuple[Solution, SubmapGraph]:
+def solved(
+    frames: Sequence[GraphFrame], pairs: Canonical, scale: KnownScale = UNKNOWN
+) -> tuple[Solution, SubmapGraph]:
     """The final poses, and which submaps they were made of; a function of the sets."""
-    solution = solve(frames, pairs.matches)
-    submaps = submap_graph(frames, pairs.matches, solution.poses, solution.dropped_pairs, pairs.extra)
-    return solution, submaps
+    solution = solve(frames, pairs.matches, _scaled(scale, frames))
+    poses = {**solution.islands, **solution.poses}
+    return solution, submap_graph(frames, pairs.matches, poses, solution.dropped_pairs, pairs.extra)
+
+
+def _scaled(scale: KnownScale, frames: Sequence[GraphFrame]) -> PoseParams:
+    if scale.marker is None:
+        return PoseParams(first_height_m=scale.first_height_m)
+    photo = named(scale.marker.image, [f.name for f in frames])
+    # a photo that is not there must not pass for the first one
+    return PoseParams(ground_px_per_m=scale.marker.ground_px_per_m, scale_image=photo or scale.marker.image)
 
 
 def draw(layout: Layout, photos: _Photos) -> dict[TileKey, bytes]:

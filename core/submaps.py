@@ -25,7 +25,7 @@ Georeference = Literal["gps", "tie", "none"]
 class Submap:
     """What the first matches of one drone connect; 0 is the largest.
 
-    `merged`: the connected map that it became part of, `submap` in poses.json; None: it has no place.
+    `merged`: the connected map that it became part of, `submap` in poses.json; None: it has no pose.
     `georeferenced_by`: its own GPS, a tie to a submap with GPS, or nothing.
     """
 
@@ -237,11 +237,14 @@ def _submaps(
         yield Submap(k, tuple(f.frame_id for f in fs), fs[0].meta.drone, home, by)
 
 
-def joins(merged: Mapping[str, int], new_ids: Collection[str], matches: Iterable[PairMatch]) -> bool:
-    """Whether the matches of new frames tie frames of different connected maps: then all is solved again."""
+def joins(merged: Mapping[str, int | str], new_ids: Collection[str], matches: Iterable[PairMatch]) -> bool:
+    """Whether the matches of new frames tie frames of different connected maps: then all is solved again.
+
+    `merged`: which map each known frame is part of.
+    """
     touching = [m for m in matches if m.accepted and (m.low in new_ids or m.high in new_ids)]
     known = {f: merged[f] for m in touching for f in (m.low, m.high) if f in merged}
-    nodes: list[int | str] = [*sorted(set(known.values())), *sorted(new_ids)]
+    nodes: list[int | str] = [*sorted(set(known.values()), key=str), *sorted(new_ids)]
     index = {node: k for k, node in enumerate(nodes)}
     ends = [(known.get(m.low, m.low), known.get(m.high, m.high)) for m in touching]
     label = parts(len(nodes), [(index[a], index[b]) for a, b in ends if a in index and b in index])

@@ -32,7 +32,7 @@ class PoseParams:
     believed of them afterwards. `min_downward`: cosine of the steepest tilt by the gimbal that still makes a
     map photo; `oblique_ratio`: the furthest corner, in heights. Without GPS the scale comes from the first
     frame (Avola 2019, 2.1): `first_height_m` above ground, or `ground_px_per_m`, pixels per metre of ground
-    as a marker of known size shows them.
+    as a marker of known size shows them, in the photo of the name `scale_image` if that is given.
     """
 
     points_per_edge: int = 32
@@ -63,6 +63,7 @@ class PoseParams:
     assumed_height_m: float = 60.0
     first_height_m: float | None = None
     ground_px_per_m: float | None = None
+    scale_image: str | None = None
     first_height_log_sigma: float = 0.01
     far_m: float = 50_000.0
     oblique_ratio: float = 10.0
@@ -82,9 +83,11 @@ class Solution:
     map; the centre then departs from the drone's by height × slope.
 
     `cameras`: refined, by `FrameMeta.camera_key`. `poses`: by frame id. `unplaced`: frame id → error code of
-    `core.errors`. `reprojection_rms_px`: over the correspondences of all trusted pairs, in pixels of the
-    original photos, wild ones (beyond ten robust standard deviations) left out. `dropped_pairs`: (low, high)
-    ids of matches that contradict the rest. `lag_s`: by drone, how long its GPS lags the shutter.
+    `core.errors`. `islands`: poses of unplaced frames that tie to each other but to no GPS, in metres of
+    their own submap, whose place and heading are not known. `reprojection_rms_px`: over the
+    correspondences of all trusted pairs, in pixels of the original photos, wild ones (beyond ten
+    robust standard deviations) left out. `dropped_pairs`: (low, high) ids of matches that contradict the
+    rest. `lag_s`: by drone, how long its GPS lags the shutter.
     `yaw_offset_rad`: by drone, what to add to the metadata's yaw. `gps_sigma_m`: by drone, as observed.
     """
 
@@ -97,6 +100,7 @@ class Solution:
     lag_s: Mapping[str, float] = field(default_factory=dict)
     yaw_offset_rad: Mapping[str, float] = field(default_factory=dict)
     gps_sigma_m: Mapping[str, float] = field(default_factory=dict)
+    islands: Mapping[str, Pose] = field(default_factory=dict)
     edges: int = 0
     observations: int = 0
     steps: int = 0

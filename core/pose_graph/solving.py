@@ -216,6 +216,7 @@ def _share_of_ground(pairs: IntArray, down: Array, state: State) -> float:
 
 def _solution(s: Survey, graph: Graph | None, params: PoseParams) -> Solution:
     poses: dict[str, Pose] = {}
+    islands: dict[str, Pose] = {}
     cameras = dict(zip(s.camera_keys, s.cameras, strict=True))
     names = [(f.name, f.frame_id) for f in s.frames]
     label = np.arange(len(s))
@@ -227,7 +228,7 @@ def _solution(s: Survey, graph: Graph | None, params: PoseParams) -> Solution:
         state = graph.adjusted.state
         cameras = {k: refined(c, lens) for (k, c), lens in zip(cameras.items(), state.lens, strict=True)}
         label = submaps(len(s), graph.rows[graph.edges.pairs], names)
-        poses = _visual(s, graph, label)
+        poses, islands = _visual(s, graph, label)
         lag = {d: float(v) for d, v in zip(s.drones, state.lag_s, strict=True)}
         offset = yaw_offsets(graph.s, heading(state.R), np.ones(len(graph.s), bool))
         gps_sigma = {
@@ -240,10 +241,13 @@ def _solution(s: Survey, graph: Graph | None, params: PoseParams) -> Solution:
     for k, pose in gnss_poses(s, rest, poses, offset, params).items():
         poses[s.frames[k].frame_id] = replace(pose, submap=int(label[k]))
     for k, f in enumerate(s.frames):
+        home = poses if f.frame_id in poses else islands
         if f.frame_id not in poses:
             unplaced[f.frame_id] = "far_from_mission" if s.far[k] else "not_placeable"
-        elif is_oblique(poses[f.frame_id], cameras[f.meta.camera_key], params.oblique_ratio):
-            del poses[f.frame_id]
+        if f.frame_id in home and is_oblique(
+            home[f.frame_id], cameras[f.meta.camera_key], params.oblique_ratio
+        ):
+            del home[f.frame_id]
             unplaced[f.frame_id] = "oblique"
     return Solution(
         world=s.world,
@@ -255,6 +259,7 @@ def _solution(s: Survey, graph: Graph | None, params: PoseParams) -> Solution:
         lag_s=lag,
         yaw_offset_rad={d: float(v) for d, v in zip(s.drones, offset, strict=True) if np.isfinite(v)},
         gps_sigma_m=gps_sigma,
+        islands={k: islands[k] for k in sorted(islands)},
         edges=len(graph.edges) if graph else 0,
         observations=len(graph.edges.uv) if graph else 0,
         steps=steps,
@@ -267,29 +272,30 @@ def refined(camera: Camera, lens: Array) -> Camera:
     return replace(camera, f_px=f_px, k1=k1, k2=k2)
 
 
-def _visual(s: Survey, graph: Graph, label: IntArray) -> dict[str, Pose]:
+def _visual(s: Survey, graph: Graph, label: IntArray) -> tuple[dict[str, Pose], dict[str, Pose]]:
     """Poses of the tied frames whose submap has a place: GPS somewhere in it, or no GPS in the whole
-    mission.
+    mission; and of those on islands, which have none.
     """
     state = graph.adjusted.state
     nowhere = not s.has_gps.any()
     size = np.bincount(label)
     fixed = np.zeros(len(size), bool)
     fixed[label[s.has_gps]] = True
-    poses = {}
+    poses, islands = dict[str, Pose](), dict[str, Pose]()
     for k, row in enumerate(graph.rows.tolist()):
         sane = state.t[k, 2] - state.h[k] > 0.5 and np.isfinite(state.R[k]).all()
-        if size[label[row]] < 2 or not sane or not (fixed[label[row]] or nowhere):
+        if size[label[row]] < 2 or not sane:
             continue
-        poses[s.frames[row].frame_id] = Pose(
+        home = poses if fixed[label[row]] or nowhere else islands
+        home[s.frames[row].frame_id] = Pose(
             world_R_cam=state.R[k],
             center=state.t[k],
             ground_h_m=float(state.h[k]),
-            source="vision-only" if nowhere else "visual",
+            source="visual" if fixed[label[row]] else "vision-only",
             submap=int(label[row]),
             sigma_m=_triple(graph.sigma_m[k]),
         )
-    return poses
+    return poses, islands
 
 
 def _triple(sigma: Array) -> tuple[float, float, float] | None:

@@ -101,8 +101,13 @@ def starting(s: Survey, edges: Edges, submap: IntArray, params: PoseParams) -> S
 
 
 def first_of_known_height(s: Survey, params: PoseParams) -> tuple[int, float] | None:
-    """The first frame of the flight and its height above ground, metres, when that was given."""
-    first = min(range(len(s)), key=lambda k: capture_order(s.frames[k]))
+    """The first frame of the flight (or the one that a marker is seen in) and its height above ground in
+    metres, when that was given.
+    """
+    among = [k for k, f in enumerate(s.frames) if params.scale_image in (None, f.name)]
+    if not among:
+        return None
+    first = min(among, key=lambda k: capture_order(s.frames[k]))
     if params.first_height_m is not None:
         return first, params.first_height_m
     if params.ground_px_per_m is not None:
