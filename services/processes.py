@@ -33,6 +33,10 @@ _MAX_BACKOFF_S = 5.0
 _LOCK_WAIT_S = 4.0
 _PR_SET_PDEATHSIG = 1
 
+WARM = "orthostream worker is warm"
+"""The line of a child's output that says it can begin at once; it is not passed on."""
+_WARM_WAIT_S = 30.0
+
 WORK_STAGES = ("workers.ingest", "workers.match", "workers.fuse", "workers.publish", "workers.export")
 SEQUENCE_STAGES = ("workers.sequence",)
 
@@ -65,6 +69,7 @@ class Program:
     name: str
     argv: tuple[str, ...]
     stop_signal: signal.Signals = signal.SIGTERM
+    warms_up: bool = False
 
 
 @dataclass
@@ -75,6 +80,7 @@ class _Child:
     failures: int = 0
     due_at: float = 0.0
     tail: bytes = b""
+    warm: bool = False
 
     def alive(self) -> bool:
         return self.process is not None and self.process.poll() is None
@@ -138,8 +144,8 @@ def programs(settings: Settings, listener: socket.socket) -> list[Program]:
         *broker,
         Program("api", api),
         # SIGQUIT is celery's "now": what was cut off is done again, so there is nothing to wait for.
-        Program("worker", _celery("work", settings.workers, WORK_STAGES), signal.SIGQUIT),
-        Program("sequencer", _celery("sequence", 1, SEQUENCE_STAGES), signal.SIGQUIT),
+        Program("worker", _celery("work", settings.workers, WORK_STAGES), signal.SIGQUIT, warms_up=True),
+        Program("sequencer", _celery("sequence", 1, SEQUENCE_STAGES), signal.SIGQUIT, warms_up=True),
     ]
 
 
@@ -202,12 +208,13 @@ class Supervisor:
     def run(self, on_ready: Callable[[str], None] = lambda url: None) -> None:
         """Starts the tree, keeps it alive, and returns once all of it has stopped. Raises StackFailed."""
         before = {s: signal.signal(s, self._on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
+        patient_until = time.monotonic() + _WARM_WAIT_S
         try:
             self._start_broker()
             while not self._stopping:
                 self._revive()
                 self._pump(0.1)
-                if not self._ready and self._answers():
+                if not self._ready and self._warm(patient_until) and self._answers():
                     self._ready = True
                     self._announce()
                     on_ready(self.url)
@@ -292,13 +299,21 @@ class Supervisor:
                 pipe.close()
             *lines, child.tail = (child.tail + data).split(b"\n")
             for line in lines:
-                self._say(child.program.name, line.decode(errors="replace"))
+                if line == WARM.encode():
+                    child.warm = True
+                else:
+                    self._say(child.program.name, line.decode(errors="replace"))
 
     def _say(self, name: str, line: str) -> None:
         if line.strip():
             with suppress(OSError, ValueError):  # nobody listens any more: no reason to stop working
                 self._out.write(f"{name:<9} | {line.rstrip()}\n")
                 self._out.flush()
+
+    def _warm(self, patient_until: float) -> bool:
+        """Whether whoever uploads now is served at full speed, or has waited long enough for that."""
+        late = time.monotonic() > patient_until
+        return late or all(c.warm for c in self._children.values() if c.program.warms_up)
 
     def _answers(self) -> bool:
         host, port = self._listener.getsockname()[:2]

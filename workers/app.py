@@ -12,6 +12,7 @@ import gc
 import logging
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,7 +26,7 @@ from services.catalog import missions
 from services.database import Database
 from services.errors import LeaseLost, MissionNotFound
 from services.logging import configure_logging
-from services.processes import die_with
+from services.processes import WARM, die_with
 from services.queue import make_celery
 from services.settings import get_settings
 from services.storage import get_store
@@ -117,6 +118,12 @@ def before_the_fork(prepare: Callable[[], None]) -> None:
         log.info("warm", seconds=round(time.perf_counter() - started, 2))
 
     signals.worker_init.connect(run, weak=False)
+
+
+@signals.worker_ready.connect  # type: ignore[untyped-decorator]
+def _say_so(**_: Any) -> None:
+    assert sys.__stdout__ is not None
+    print(WARM, file=sys.__stdout__, flush=True)  # sys.stdout is celery's, and goes to the log
 
 
 @signals.worker_before_create_process.connect  # type: ignore[untyped-decorator]

@@ -9,7 +9,10 @@ SETTINGS = {"ignore_unknown_options": True, "allow_extra_args": True, "help_opti
 
 def app() -> None:
     """Runs the command line; what goes wrong as foreseen ends with a sentence and exit code 2."""
+    from services.bytecode import keep_compiled
+
     try:
+        keep_compiled()
         _run()
     except KeyboardInterrupt:
         sys.exit(130)

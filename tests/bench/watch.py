@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import psutil
 
 LOOK_S, WEIGH_S = 0.1, 0.6
+ENDS = ("broker", "api", "sequencer", "workers")
 
 
 def label(process: psutil.Process) -> str:
@@ -61,7 +62,7 @@ def watch(command: Sequence[str]) -> Watched:
             try:
                 times = member.cpu_times()
                 cpu[member.pid] = times.user + times.system
-                if names.get(member.pid, "cli") == "cli":  # a child is its parent's copy until it has begun
+                if names.get(member.pid) not in ENDS:  # a child is its parent's copy until it has begun
                     names[member.pid] = label(member)
                 total += member.memory_full_info().pss if weigh else 0
             except psutil.NoSuchProcess:
