@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.geometry import Array
-from core.pose_graph.elimination import plan, solve_blocks
 from core.pose_graph.residuals import IntArray
-
-ComplexArray = NDArray[np.complex128]
+from core.pose_graph.sparse import ComplexArray, solve_hermitian, summed
 
 # Tilt and relief move points by a few per cent of the height: what a similarity cannot explain.
 MODEL_ERROR = 0.03
@@ -43,27 +41,19 @@ class Similarities:
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Sums over a pair's points that its quadratic form is made of, (E, 4, 4) each, divided by the count."""
+    """Means over a pair's points that its quadratic form is made of, (E, 2, 2) each."""
 
-    first: Array
-    second: Array
-    mixed: Array
+    first: ComplexArray
+    second: ComplexArray
+    mixed: ComplexArray
 
 
-def _blocks(a: ComplexArray, b: ComplexArray, counts: IntArray, starts: IntArray) -> Array:
-    """Mean of A(a)ᵀA(b) with A(p) = [[pr, −pi, 1, 0], [pi, pr, 0, 1]]: (E, 4, 4)."""
-    product = np.add.reduceat(np.conj(a) * b, starts) / counts
-    mean_a, mean_b = np.add.reduceat(a, starts) / counts, np.add.reduceat(b, starts) / counts
-    out = np.zeros((len(counts), 4, 4))
-    for rows, cols, value in (
-        (slice(0, 2), slice(0, 2), product),
-        (slice(0, 2), slice(2, 4), np.conj(mean_a)),
-        (slice(2, 4), slice(0, 2), mean_b),
-    ):
-        out[:, rows, cols] = np.stack(
-            (np.stack((value.real, -value.imag), -1), np.stack((value.imag, value.real), -1)), 1
-        )
-    out[:, 2, 2] = out[:, 3, 3] = 1.0
+def _blocks(a: ComplexArray, b: ComplexArray, counts: IntArray, starts: IntArray) -> ComplexArray:
+    """Mean of (p, 1)ᴴ(q, 1) over each pair's points: (E, 2, 2)."""
+    out = np.ones((len(counts), 2, 2), complex)
+    out[:, 0, 0] = np.add.reduceat(np.conj(a) * b, starts) / counts
+    out[:, 0, 1] = np.conj(np.add.reduceat(a, starts)) / counts
+    out[:, 1, 0] = np.add.reduceat(b, starts) / counts
     return out
 
 
@@ -79,12 +69,16 @@ def moments(first: ComplexArray, second: ComplexArray, starts: IntArray) -> Mome
 
 def ratios(m: Moments) -> tuple[ComplexArray, Array]:
     """z_i / z_j of each pair (E,), and how widely its points spread (E,)."""
-    first = m.first[:, 0, 2] - 1j * m.first[:, 1, 2]
-    second = m.second[:, 0, 2] - 1j * m.second[:, 1, 2]
-    common = m.mixed[:, 0, 0] + 1j * m.mixed[:, 1, 0] - np.conj(first) * second
-    wide_i = np.maximum(m.first[:, 0, 0] - np.abs(first) ** 2, 1e-9)
-    wide_j = np.maximum(m.second[:, 0, 0] - np.abs(second) ** 2, 1e-9)
+    first, second = m.first[:, 1, 0], m.second[:, 1, 0]
+    common = m.mixed[:, 0, 0] - np.conj(first) * second
+    wide_i = np.maximum(m.first[:, 0, 0].real - np.abs(first) ** 2, 1e-9)
+    wide_j = np.maximum(m.second[:, 0, 0].real - np.abs(second) ** 2, 1e-9)
     return np.sqrt(wide_j / wide_i) * np.exp(1j * np.angle(common)), np.sqrt(wide_i * wide_j)
+
+
+def steps(m: Moments, pairs: IntArray, z: ComplexArray) -> ComplexArray:
+    """c_i − c_j of each pair (E,) when its frames have the scales and headings `z` (N,)."""
+    return np.asarray(z[pairs[:, 1]] * m.second[:, 1, 0] - z[pairs[:, 0]] * m.first[:, 1, 0])
 
 
 def average(
@@ -108,32 +102,23 @@ def average(
     i, j = pairs[:, 0], pairs[:, 1]
     edge_weight, gps_weight = np.ones(len(pairs)), np.ones(n)
     height = np.full(n, height_m)
-    x, error = np.zeros((n, 4)), np.zeros(len(pairs))
-    structure = plan(n, pairs)
+    x, error = np.zeros((n, 2), complex), np.zeros(len(pairs))
     chained = np.isfinite(expected)
     trust = np.where(chained, 1 / (CHAINED * np.maximum(np.abs(expected), 1e-3)) ** 2, 0.0)
     for turn in range(ROUNDS):
-        w = edge_weight * POINTS_WORTH / (MODEL_ERROR * np.sqrt(height[i] * height[j])) ** 2
-        H, g = np.zeros((n, 4, 4)), np.zeros((n, 4))
-        np.add.at(H, i, w[:, None, None] * m.first)
-        np.add.at(H, j, w[:, None, None] * m.second)
+        w = (edge_weight * POINTS_WORTH / (MODEL_ERROR * np.sqrt(height[i] * height[j])) ** 2)[:, None, None]
         wg = np.where(known, gps_weight / gps_sigma**2, 0.0)
-        H[:, 2, 2] += wg
-        H[:, 3, 3] += wg
-        g[known, 2], g[known, 3] = (wg * gps.real)[known], (wg * gps.imag)[known]
+        H = summed(n, pairs, w * m.first, w * m.second) + np.eye(2) * 1e-9
         H[:, 0, 0] += trust
-        H[:, 1, 1] += trust
-        g[chained, 0] = (trust * expected.real)[chained]
-        g[chained, 1] = (trust * expected.imag)[chained]
-        H[roots] += np.eye(4) * 1e3
+        H[:, 1, 1] += wg
+        H[roots] += np.eye(2) * 1e3
+        g = np.column_stack((np.where(chained, trust * expected, 0.0), np.where(known, wg * gps, 0.0)))
         g[roots, 0] += 1e3 * height_m
-        H += np.eye(4) * 1e-9
-        solved = solve_blocks(structure, H, -w[:, None, None] * m.mixed, g)
+        solved = solve_hermitian(pairs, H, -w * m.mixed, g)
         if solved is None:
             break
-        x, _ = solved
-        before = error
-        z = x[:, 0] + 1j * x[:, 1]
+        x, before = solved, error
+        z = x[:, 0]
         # a frame whose pairs were all turned down tends to z = 0: never let that raise the pairs' weight
         height = np.clip(np.abs(z), 0.3 * np.median(np.abs(z)), 3 * np.median(np.abs(z))).clip(1e-3)
         error = _pair_error(x, i, j, m) / np.sqrt(height[i] * height[j])
@@ -142,21 +127,21 @@ def average(
         bend = MODEL_ERROR * max(1.0, 4.0 * 0.6**turn)
         edge_weight = 1 / (1 + (error / bend) ** 2) ** 2
         if known.any():
-            miss = np.abs(np.where(known, gps - (x[:, 2] + 1j * x[:, 3]), 0.0))
+            miss = np.abs(np.where(known, gps - x[:, 1], 0.0))
             scale = np.maximum(gps_sigma, 1.5 * np.median(miss[known])) * max(1.0, 3.0 * 0.6**turn)
             gps_weight = 1 / (1 + (miss / scale) ** 2)
-    return Similarities(x[:, 0] + 1j * x[:, 1], x[:, 2] + 1j * x[:, 3], error)
+    return Similarities(x[:, 0], x[:, 1], error)
 
 
-def _pair_error(x: Array, i: IntArray, j: IntArray, m: Moments) -> Array:
+def _pair_error(x: ComplexArray, i: IntArray, j: IntArray, m: Moments) -> Array:
     """RMS distance (E,), metres, between a pair's points as its two frames lay them down."""
     a, b = x[i], x[j]
     total = (
-        np.einsum("ea,eab,eb->e", a, m.first, a)
-        + np.einsum("ea,eab,eb->e", b, m.second, b)
-        - 2 * np.einsum("ea,eab,eb->e", a, m.mixed, b)
+        np.einsum("ea,eab,eb->e", np.conj(a), m.first, a)
+        + np.einsum("ea,eab,eb->e", np.conj(b), m.second, b)
+        - 2 * np.einsum("ea,eab,eb->e", np.conj(a), m.mixed, b)
     )
-    return np.asarray(np.sqrt(np.maximum(total, 0.0)))
+    return np.asarray(np.sqrt(np.maximum(total.real, 0.0)))
 
 
 def fit_similarity(source: ComplexArray, target: ComplexArray, sigma: Array) -> tuple[complex, complex]:

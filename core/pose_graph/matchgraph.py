@@ -13,9 +13,9 @@ from scipy.sparse.csgraph import connected_components
 
 from core.geometry import Array, Camera
 from core.matching import PairMatch
-from core.pose_graph.averaging import ComplexArray
 from core.pose_graph.model import PoseParams
 from core.pose_graph.residuals import Edges, IntArray
+from core.pose_graph.sparse import ComplexArray
 
 GRID = 8
 _compile: Callable[[Any], Any] = numba.njit(cache=True, nogil=True)

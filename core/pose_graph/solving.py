@@ -69,6 +69,7 @@ def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
     names = [(f.name, f.frame_id) for f in tied.frames]
     every, submap = edges, submaps(len(tied), edges.pairs, names)
     start = starting(tied, edges.thinned(params.coarse_points), submap, params)
+    tied = start.survey
     keep = start.edge_error < max(0.3, 6 * float(np.median(start.edge_error)))
     edges = edges.subset(keep)
     priors = priors_of(tied, start, submap, params)

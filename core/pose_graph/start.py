@@ -9,12 +9,22 @@ from numpy.typing import NDArray
 
 from core.geometry import Array
 from core.pose_graph.attitude import circular_mean, level_to_world, levelling, rotation_of
-from core.pose_graph.averaging import ComplexArray, Similarities, average, fit_similarity, moments, ratios
-from core.pose_graph.chaining import chained
+from core.pose_graph.averaging import (
+    Moments,
+    Similarities,
+    average,
+    fit_similarity,
+    moments,
+    ratios,
+    steps,
+)
+from core.pose_graph.chaining import chained, spanned
+from core.pose_graph.fixes import contradicted
 from core.pose_graph.matchgraph import flat_rays
 from core.pose_graph.model import PoseParams
 from core.pose_graph.priors import gravity
 from core.pose_graph.residuals import Edges, IntArray, State
+from core.pose_graph.sparse import ComplexArray
 from core.pose_graph.survey import Survey, capture_order
 
 # GPS holds a submap's scale and heading when it knows them better than this (share, radians).
@@ -26,11 +36,12 @@ WELL_COVERED = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """`state` of all frames; `held_by_gps` (S,) by submap whether GPS gives it scale and heading; `height`
-    (N,) expected metres above ground; `edge_error` (E,) share of the height; `yaw_offset` by drone, NaN if
-    unknown.
+    """`survey` without the fixes that the pictures contradict; `state` of all frames; `held_by_gps` (S,) by
+    submap whether GPS gives it scale and heading; `height` (N,) expected metres above ground; `edge_error`
+    (E,) share of the height; `yaw_offset` by drone, NaN if unknown.
     """
 
+    survey: Survey
     state: State
     held_by_gps: NDArray[np.bool_]
     height: Array
@@ -59,45 +70,76 @@ def expected_down(s: Survey) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def starting(s: Survey, edges: Edges, submap: IntArray, params: PoseParams) -> Start:
-    """One linear solve for all submaps; where GPS cannot hold one, metadata give its scale and heading."""
+    """Shapes of all submaps from pairs alone, fixes that contradict them out; then one linear solve for all.
+    Where GPS cannot hold a submap, metadata give its scale and heading.
+    """
     level = levelling(expected_down(s)[0])
-    count = int(submap.max()) + 1
+    m = moments(*flat_rays(edges, s.cameras, level), edges.starts)
+    roots = _roots(edges.pairs, submap)
+    guess = _typical(s.relative_alt_m, params.assumed_height_m)
+    chain = guess * chained(edges.pairs, *ratios(m), roots, len(s))
+    s = s.without_fixes(_contradicted(s, edges.pairs, m, chain, submap, roots))
+    count = len(roots)
     held = np.array([_gps_holds(s, submap == k) for k in range(count)])
     size = np.bincount(submap, minlength=count)
     whole = held & (np.bincount(submap, s.has_gps, count) >= WELL_COVERED * size)
-    degree = np.bincount(edges.pairs.ravel(), minlength=len(s))
-    roots = [
-        int(np.flatnonzero(submap == k)[np.argmax(degree[submap == k])]) for k in range(count) if not whole[k]
-    ]
     gps = np.where(whole[submap] & s.has_gps, s.gps[:, 0] + 1j * s.gps[:, 1], np.nan)
-    guess = _typical(s.relative_alt_m, params.assumed_height_m)
-    first, second = flat_rays(edges, s.cameras, level)
-    m = moments(first, second, edges.starts)
-    chain = np.full(len(s), np.nan, complex)
-    if roots:
-        z = guess * chained(edges.pairs, *ratios(m), roots, len(s))
-        chain[~whole[submap]] = z[~whole[submap]]
-    averaged = average(edges.pairs, m, gps, s.gps_sigma, np.array(roots, np.int64), guess, chain)
-    first_frame = first_of_known_height(s, params)
-    placed, offset = _georeferenced(s, averaged, submap, held, first_frame, params)
-    height = np.abs(placed.z)
-    expected = np.ones(len(s))
-    ground = np.zeros(len(s))
-    for k in range(count):
-        mine = submap == k
-        middle = max(float(np.median(height[mine])), 1.0)
-        height[mine] = np.clip(height[mine], 0.4 * middle, 2.5 * middle)
-        expected[mine] = middle
-        altitude = s.gps[mine, 2] - height[mine]
-        if np.isfinite(altitude).any():
-            ground[mine] = np.nanmedian(altitude)
-    if first_frame is not None and not held[submap[first_frame[0]]]:
-        expected[first_frame[0]] = first_frame[1]
+    fixed = np.array([root for k, root in enumerate(roots) if not whole[k]], np.int64)
+    expected = np.where(whole[submap], np.nan, chain)
+    averaged = average(edges.pairs, m, gps, s.gps_sigma, fixed, guess, expected)
+    first = first_of_known_height(s, params)
+    placed, offset = _georeferenced(s, averaged, submap, held, first, params)
+    height, ground = _heights(s, placed, submap)
     centre = np.column_stack((placed.c.real, placed.c.imag, ground + height))
     lens = np.array([(c.f_px, c.k1, c.k2) for c in s.cameras])
     R = level_to_world(-np.angle(placed.z)) @ level
     state = State(R, centre, ground, lens, np.zeros(len(s.drones)))
-    return Start(state, held, expected, averaged.error, offset)
+    usual = np.array([max(float(np.median(np.abs(placed.z[submap == k]))), 1.0) for k in range(count)])[
+        submap
+    ]
+    if first is not None and not held[submap[first[0]]]:
+        usual[first[0]] = first[1]
+    return Start(s, state, held, usual, averaged.error, offset)
+
+
+def _roots(pairs: IntArray, submap: IntArray) -> list[int]:
+    """The frame with most pairs of each submap."""
+    degree = np.bincount(pairs.ravel(), minlength=len(submap))
+    order = np.lexsort((np.arange(len(submap)), -degree, submap))
+    return [int(k) for k in order[np.searchsorted(submap[order], np.arange(int(submap.max()) + 1))]]
+
+
+def _contradicted(
+    s: Survey, pairs: IntArray, m: Moments, z: ComplexArray, submap: IntArray, roots: list[int]
+) -> NDArray[np.bool_]:
+    """(N,) which fixes the pictures around them contradict."""
+    bad = np.zeros(len(s), bool)
+    gps = s.gps[:, 0] + 1j * s.gps[:, 1]
+    step = steps(m, pairs, z)
+    size = np.sqrt(np.abs(z[pairs[:, 0]] * z[pairs[:, 1]]))
+    place, miss = spanned(pairs, step, size, roots, len(s))
+    row = np.empty(len(s), np.int64)
+    for k in range(len(roots)):
+        mine = np.flatnonzero(submap == k)
+        row[mine] = np.arange(len(mine))
+        own = submap[pairs[:, 0]] == k
+        bad[mine] = contradicted(
+            gps[mine], s.gps_sigma[mine], row[pairs[own]], step[own], miss[own], place[mine]
+        )
+    return bad
+
+
+def _heights(s: Survey, placed: Similarities, submap: IntArray) -> tuple[Array, Array]:
+    """Start values (N,) of each frame's height above ground, and of the ground's height."""
+    height, ground = np.abs(placed.z), np.zeros(len(s))
+    for k in range(int(submap.max()) + 1):
+        mine = submap == k
+        middle = max(float(np.median(height[mine])), 1.0)
+        height[mine] = np.clip(height[mine], 0.4 * middle, 2.5 * middle)
+        altitude = s.gps[mine, 2] - height[mine]
+        if np.isfinite(altitude).any():
+            ground[mine] = np.nanmedian(altitude)
+    return height, ground
 
 
 def first_of_known_height(s: Survey, params: PoseParams) -> tuple[int, float] | None:

@@ -58,6 +58,13 @@ class Survey:
         picked = {name: getattr(self, name)[rows] for name in _PER_FRAME}
         return replace(self, frames=tuple(self.frames[k] for k in rows), **picked)
 
+    def without_fixes(self, bad: NDArray[np.bool_]) -> Survey:
+        """The survey as if the frames `bad` (N,) had no fix, nor any speed that comes from it."""
+        if not bad.any():
+            return self
+        gps = np.where(bad[:, None], np.nan, self.gps)
+        return replace(self, gps=gps, velocity=_velocities(self.frames, self.drone, gps))
+
 
 _PER_FRAME = (
     "camera", "drone", "gps", "gps_sigma", "altitude_sigma", "velocity", "attitude", "relative_alt_m", "far",
