@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
@@ -186,8 +186,9 @@ def observations(
     checkpoints: Checkpoints, world: World, frames: Mapping[str, PosedFrame]
 ) -> list[Observation]:
     """Every sighting in a visually posed frame (by photo name), in the order of the file."""
-    index = _FrameNames(frames)
-    seen = [(s, f) for s in checkpoints.sightings if (f := index.find(s.image)) and f.pose.source != "gnss"]
+    index = _Names(frames)
+    shot = [(s, frames[name]) for s in checkpoints.sightings if (name := index.find(s.image))]
+    seen = [(s, f) for s, f in shot if f.pose.source != "gnss"]
     if not seen:
         return []
     to_wgs84 = Transformer.from_crs(checkpoints.crs, 4326, always_xy=True)
@@ -234,21 +235,54 @@ def by_name(named: Iterable[tuple[str, PosedFrame]]) -> dict[str, PosedFrame]:
     return {name: group[0] for name, group in groups.items() if len(group) == 1}
 
 
-class _FrameNames:
-    """Frames by name, or by the file name alone where frames carry folders or the list does."""
+def checkpoints_document(
+    checkpoints: Checkpoints,
+    world: World | None,
+    frames: Mapping[str, PosedFrame],
+    here: Collection[str],
+    shown: Mapping[str, Any] | None,
+) -> dict[str, Any]:
+    """What a report says of the points: through the posed `frames` (by photo name), and in the mosaic.
 
-    def __init__(self, frames: Mapping[str, PosedFrame]) -> None:
-        self._frames = frames
+    `here`: the names of all photos of the mission; `shown`: `core.mosaic_points.mosaic_document`, None before
+    anybody looked. A point that no pose shows says why in `unseen`: "no_photo" (none of its photos is here)
+    or "not_posed" (none of them is on the map by its picture).
+    """
+    seen = observations(checkpoints, world, frames) if world else []
+    checks = [o for o in seen if o.sighting.point not in checkpoints.used]
+    through_poses, in_mosaic = point_errors(seen), (shown or {}).get("points", {})
+    names = _Names(here)
+    near = {s.point for s in checkpoints.sightings if names.find(s.image)}
+
+    def entry(point: str) -> dict[str, Any]:
+        known = through_poses.get(point)
+        poses = None if known is None else {k: v for k, v in asdict(known).items() if k != "point"}
+        why = None if known else "not_posed" if point in near else "no_photo"
+        used = point in checkpoints.used
+        return {"point": point, "used": used, "poses": poses, "mosaic": in_mosaic.get(point), "unseen": why}
+
+    return {
+        "poses": asdict(_summary(checks)) if checks else None,
+        "mosaic": (shown or {}).get("mosaic"),
+        "points": [entry(point) for point in checkpoints.points],
+    }
+
+
+class _Names:
+    """Photos by name, or by the file name alone where photos carry folders or the list does."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        self._names = frozenset(names)
         self._short: dict[str, list[str]] = {}
-        for name in sorted(frames):
+        for name in sorted(names):
             self._short.setdefault(PurePosixPath(name).name.lower(), []).append(name)
 
-    def find(self, image: str) -> PosedFrame | None:
+    def find(self, image: str) -> str | None:
         """None also where two photos in different folders share the name."""
-        if image in self._frames:
-            return self._frames[image]
+        if image in self._names:
+            return image
         names = self._short.get(PurePosixPath(image.replace("\\", "/")).name.lower(), [])
-        return self._frames[names[0]] if len(names) == 1 else None
+        return names[0] if len(names) == 1 else None
 
 
 def _meet(frame: PosedFrame, uv: tuple[float, float], h_m: float) -> Array:

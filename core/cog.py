@@ -42,6 +42,9 @@ class MosaicParams:
 DEFAULT = MosaicParams()
 
 
+LOCAL = "Not georeferenced: no photo has GPS. Place and north are assumed."
+
+
 def flight_gsd_m(frames: Sequence[PosedFrame]) -> float:
     """The flight's ground sampling distance: the median over its frames, metres. Raises NothingToMap."""
     gsds = [f.pose.gsd_m(f.camera) for f in frames if ground_outline(f) is not None]
@@ -144,6 +147,8 @@ def _draw(
     }
     windows = list(_windows(grid, params.window_px))
     with rasterio.open(path, "w", **profile) as out:
+        if any(f.pose.source == "vision-only" for f in frames):
+            out.update_tags(TIFFTAG_IMAGEDESCRIPTION=LOCAL, GEOREFERENCED="NO")
         out.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
         for done, (col, row, width, height) in enumerate(windows, 1):
             window = grid.window(col, row, width, height)

@@ -17,7 +17,7 @@ from pyproj import Transformer
 from core.cog import MosaicParams as MosaicParams
 from core.cog import flight_gsd_m as flight_gsd_m
 from core.cog import write_mosaic as write_mosaic
-from core.geometry import Array, Camera, PosedFrame, World
+from core.geometry import Array, Camera, Pose, PosedFrame, World
 from core.grid import utm_epsg
 from core.outline import ground_outline
 
@@ -74,17 +74,64 @@ def grid_pose(world: World, frame: PosedFrame, to_crs: Transformer) -> GridPose:
     return GridPose(rotation, center, float(alt - scale * (alt - foot[2])))
 
 
-def poses_document(world: World, frames: Sequence[NamedFrame]) -> dict[str, Any]:
-    """The content of poses.json, in the UTM zone of the world's origin, frames in capture order."""
+@dataclass(frozen=True, slots=True)
+class WaitingFrame:
+    """A frame that waits for a tie, with its pose in metres of its own island; None: it is alone."""
+
+    name: str
+    frame_id: str
+    camera: Camera
+    pose: Pose | None
+    captured_s: float | None = None
+
+
+LOCAL_NOTE = (
+    "Not georeferenced: no photo has GPS. Shape and relative heights are right, place and north are assumed, "
+    "and so is the scale unless a first height or a marker was given."
+)
+
+
+def is_local(frames: Sequence[NamedFrame]) -> bool:
+    """Whether the map lies where nobody knows: vision alone has made it."""
+    return any(f.posed.pose.source == "vision-only" for f in frames)
+
+
+def poses_document(
+    world: World, frames: Sequence[NamedFrame], waiting: Sequence[WaitingFrame] = ()
+) -> dict[str, Any]:
+    """The content of poses.json, in the UTM zone of the world's origin, frames in capture order.
+
+    A map that is not georeferenced says so; `waiting` frames come apart, in metres of their own islands.
+    """
     epsg = utm_epsg(world.lat_deg, world.lon_deg)
     to_crs = Transformer.from_crs(4326, epsg, always_xy=True)
     ordered = in_capture_order(frames)
-    cameras = list(dict.fromkeys(f.posed.camera for f in ordered))
+    late = sorted(waiting, key=lambda w: (_time_or_inf(w.captured_s), w.name, w.frame_id))
+    cameras = list(dict.fromkeys([*(f.posed.camera for f in ordered), *(w.camera for w in late)]))
     index = {camera: i for i, camera in enumerate(cameras)}
     return {
         "crs": f"EPSG:{epsg}",
+        "georeferenced": not is_local(frames),
+        **({"note": LOCAL_NOTE} if is_local(frames) else {}),
         "cameras": [_camera_entry(camera) for camera in cameras],
         "frames": [_pose_entry(world, f, index[f.posed.camera], to_crs) for f in ordered],
+        "waiting": [_waiting_entry(w, index[w.camera]) for w in late],
+    }
+
+
+def _waiting_entry(frame: WaitingFrame, camera: int) -> dict[str, Any]:
+    pose = frame.pose
+    if pose is None:
+        return {"name": frame.name, "camera": camera, "submap": None}
+    return {
+        "name": frame.name,
+        "camera": camera,
+        "source": pose.source,
+        "center": [round(float(v), 4) for v in pose.center],
+        "R": [[round(float(v), 12) for v in row] for row in pose.world_R_cam],
+        "ground_height": round(pose.ground_h_m, 4),
+        "submap": pose.submap,
+        "sigma_m": [round(float(s), 4) for s in pose.sigma_m] if pose.sigma_m else None,
     }
 
 
@@ -137,7 +184,8 @@ def footprints_geojson(world: World, frames: Sequence[NamedFrame]) -> dict[str, 
                 "geometry": {"type": "Polygon", "coordinates": [_ring(world.to_geodetic(points)[:, :2])]},
             }
         )
-    return {"type": "FeatureCollection", "features": features}
+    local = {"georeferenced": False, "note": LOCAL_NOTE} if is_local(frames) else {}
+    return {"type": "FeatureCollection", **local, "features": features}
 
 
 def _ring(lon_lat: Array) -> list[list[float]]:
@@ -149,18 +197,24 @@ def _ring(lon_lat: Array) -> list[list[float]]:
 
 
 def route_csv(world: World, frames: Sequence[NamedFrame]) -> str:
-    """The flown route as CSV, in capture order: place (WGS84 and UTM), height, sigmas in metres, source."""
+    """The flown route as CSV, in capture order: place (WGS84 and UTM), height, sigmas in metres, source.
+
+    Where the map is not georeferenced there is no longitude and no latitude, and easting and northing are
+    metres from the map's own origin.
+    """
     to_crs = Transformer.from_crs(4326, utm_epsg(world.lat_deg, world.lon_deg), always_xy=True)
+    local = is_local(frames)
     table = StringIO()
     rows = csv.writer(table, lineterminator="\n")
     rows.writerow(_ROUTE_COLUMNS)
     for frame in in_capture_order(frames):
         pose = frame.posed.pose
         lon, lat, alt = world.to_geodetic(pose.center[None])[0]
-        east, north = to_crs.transform(lon, lat)
+        east, north = pose.center[:2] if local else to_crs.transform(lon, lat)
+        where = ("", "") if local else (f"{lon:.8f}", f"{lat:.8f}")
         sigmas = [f"{s:.3f}" for s in pose.sigma_m] if pose.sigma_m else ["", "", ""]
         height = pose.center[2] - pose.ground_h_m
-        place = [f"{lon:.8f}", f"{lat:.8f}", *(f"{v:.3f}" for v in (alt, height, east, north))]
+        place = [*where, *(f"{v:.3f}" for v in (alt, height, east, north))]
         rows.writerow([frame.name, _iso(frame.captured_s) or "", *place, *sigmas, pose.source, pose.submap])
     return table.getvalue()
 

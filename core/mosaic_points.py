@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from core.checkpoints import CheckpointErrors, Checkpoints, Observation, PointError, rms_levels
+from core.checkpoints import Checkpoints, Observation, rms_levels
 from core.geometry import Array, World
 from core.grid import UtmGrid
 
@@ -269,30 +269,7 @@ def mosaic_errors(
     return MosaicErrors(len(checks), len(good), *levels)
 
 
-def checkpoints_document(
-    checkpoints: Checkpoints,
-    poses: CheckpointErrors | None,
-    mosaic: MosaicErrors | None,
-    through_poses: Mapping[str, PointError],
-    in_mosaic: Mapping[str, MosaicPoint],
-) -> dict[str, Any]:
-    """What report.json says of the checkpoints: both summaries, and every point of the file."""
-
-    def entry(point: str) -> dict[str, Any]:
-        known, shown = through_poses.get(point), in_mosaic.get(point)
-        return {
-            "point": point,
-            "used": point in checkpoints.used,
-            "poses": None if known is None else _without_name(asdict(known)),
-            "mosaic": None if shown is None else _without_name(asdict(shown)),
-        }
-
-    return {
-        "poses": None if poses is None else asdict(poses),
-        "mosaic": None if mosaic is None else asdict(mosaic),
-        "points": [entry(point) for point in checkpoints.points],
-    }
-
-
-def _without_name(entry: dict[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in entry.items() if k != "point"}
+def mosaic_document(points: Mapping[str, MosaicPoint], errors: MosaicErrors | None) -> dict[str, Any]:
+    """What was found in the mosaic, as JSON: every point looked for, and the RMS of those that check."""
+    entries = {name: {k: v for k, v in asdict(p).items() if k != "point"} for name, p in points.items()}
+    return {"mosaic": None if errors is None else asdict(errors), "points": entries}

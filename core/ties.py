@@ -6,7 +6,7 @@ measure, learnt from how alike its neighbours in its own submap look.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +40,10 @@ class TieParams:
     per_tie: int = 64
     rounds: int = 4
     reach_m: float = 300.0
+
+
+LIVE = TieParams(per_frame=2, per_tie=8)
+"""While drones fly, every photo looks at the other maps a little; the final solve looks again, and harder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +95,7 @@ def ties_to_try(
     A function of the sets. Empty when the accepted `matches` connect all frames.
     """
     params = params or TieParams()
-    ordered = [f for _, f in sorted({f.frame_id: f for f in frames}.items())]
-    index = {f.frame_id: k for k, f in enumerate(ordered)}
+    ordered, index = _indexed(frames)
     edges = [
         (index[m.low], index[m.high], max(m.counts.guided, len(m.uv_low)))
         for m in sorted(matches, key=lambda m: (m.low, m.high))
@@ -101,15 +104,59 @@ def ties_to_try(
     part = np.array(parts(len(ordered), [(i, j) for i, j, _ in edges]))
     if len(ordered) < 2 or part.max() == 0:
         return []
-    done: list[list[int]] = [[] for _ in ordered]
-    for i, j in ((index[a], index[b]) for a, b in tried if a in index and b in index):
-        done[i].append(j)
-        done[j].append(i)
     shared: list[dict[int, int]] = [{} for _ in ordered]
     for i, j, points in edges:
         shared[i][j] = shared[j][i] = points
+    seekers = np.flatnonzero(part != 0)
+    proposals = _alike(ordered, part, shared, _tried(tried, index), seekers, params)
+    return _chosen(ordered, proposals, part, params)
+
+
+def live_ties(
+    seekers: Collection[str],
+    frames: Sequence[Sighting],
+    homes: Mapping[str, Hashable],
+    tried: Collection[Pair],
+    params: TieParams | None = None,
+) -> list[Pair]:
+    """Pairs (low id, high id) of `seekers` with frames of other maps, worth matching besides those `tried`.
+
+    While the mission grows: `homes` says which map each frame is part of, and each frame's thresholds are
+    the usual ones. Sorted; a function of the sets.
+    """
+    params = params or LIVE
+    ordered, index = _indexed([f for f in frames if f.frame_id in homes])
+    label = {home: k for k, home in enumerate(sorted(set(homes.values()), key=str))}
+    part = np.array([label[homes[f.frame_id]] for f in ordered], np.int64)
+    rows = np.array(sorted(index[k] for k in seekers if k in index), np.int64)
+    if not len(rows) or part.min() == part.max():
+        return []
+    proposals = _alike(ordered, part, [{} for _ in ordered], _tried(tried, index), rows, params)
+    return _chosen(ordered, proposals, part, params)
+
+
+def _indexed(frames: Iterable[Sighting]) -> tuple[list[Sighting], dict[str, int]]:
+    ordered = [f for _, f in sorted({f.frame_id: f for f in frames}.items())]
+    return ordered, {f.frame_id: k for k, f in enumerate(ordered)}
+
+
+def _tried(tried: Iterable[Pair], index: Mapping[str, int]) -> list[list[int]]:
+    """Whom each frame was matched with."""
+    done: list[list[int]] = [[] for _ in index]
+    for i, j in ((index[a], index[b]) for a, b in tried if a in index and b in index):
+        done[i].append(j)
+        done[j].append(i)
+    return done
+
+
+def _chosen(
+    ordered: Sequence[Sighting],
+    proposed: Iterable[tuple[int, int, int, int]],
+    part: NDArray[np.int64],
+    params: TieParams,
+) -> list[Pair]:
     proposals: dict[tuple[int, int], tuple[int, int]] = {}
-    for rank, score, low, high in _alike(ordered, part, shared, done, params):
+    for rank, score, low, high in proposed:
         proposals[low, high] = min(proposals.get((low, high), (rank, -score)), (rank, -score))
     return sorted((ordered[i].frame_id, ordered[j].frame_id) for i, j in _firmest(proposals, part, params))
 
@@ -119,13 +166,14 @@ def _alike(
     part: NDArray[np.int64],
     shared: Sequence[Mapping[int, int]],
     done: Sequence[Sequence[int]],
+    seekers: NDArray[np.int64],
     params: TieParams,
 ) -> Iterator[tuple[int, int, int, int]]:
-    """(rank, similarity, low, high): what each frame outside the largest submap proposes, best first."""
+    """(rank, similarity, low, high): what each of the `seekers` proposes, best first."""
     words = peculiar(np.stack([f.words for f in frames]))
     loud = 1 / np.sqrt(words.shape[1])
     above, below = (words > loud).astype(np.float32), (words < -loud).astype(np.float32)
-    at, seekers = _positions(frames), np.flatnonzero(part != 0)
+    at = _positions(frames)
     for rows in (seekers[k : k + _BLOCK] for k in range(0, len(seekers), _BLOCK)):
         # Both whole numbers: the last bits of a product shall not decide.
         common = np.rint(above[rows] @ above.T + below[rows] @ below.T)

@@ -9,8 +9,10 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from services.catalog import frames, missions, pairs
-from services.tables import Frame
+from core.checkpoints import by_name, checkpoints_document
+from core.scale import KnownScale, named
+from services.catalog import frames, missions, pairs, poses, surveys
+from services.tables import Frame, Mission
 
 _ALL = 1_000_000
 _STEPS = ("received", "ready", "matched", "posed", "fused")
@@ -21,18 +23,24 @@ _STAGES = {"ready": "ingest", "matched": "match", "posed": "sequence", "fused": 
 def report(tx: Session, mission_id: str) -> dict[str, Any]:
     """Counts by state, rejected frames with reasons, seconds and δ per stage, latency, reprojection error.
 
-    Times are seconds, the error is the RMS in pixels. Raises MissionNotFound.
+    Times are seconds, the error is the RMS in pixels. `scale`: as it was given, and whether the map has its
+    scale from there; `checkpoints`: only where points were sent, `mosaic_revision`: when they were last
+    looked for in the mosaic, which is done for each report.json. Raises MissionNotFound.
     """
     mission = missions.get(tx, mission_id)
     known = missions.progress(tx, mission_id)
     rows = frames.list(tx, mission_id, limit=_ALL)
     matched = pairs.summary(tx, mission_id)
     ended = mission.finished_at or mission.last_tile_at
+    checked = _checkpoints(tx, mission_id, rows)
     return {
         "mission": {"id": mission.id, "name": mission.name, "mode": mission.mode, "state": mission.state},
         "frames": known.frames,
         "counts": dict(known.counts),
         "rejected": [_rejected(row) for row in rows if row.state == "rejected"],
+        "waiting": [_waiting(row) for row in rows if row.state == "waiting"],
+        "georeferenced": poses.georeferenced(tx, mission_id),
+        "scale": _scale(tx, mission, rows),
         "pairs": {
             "total": matched.total,
             "done": matched.done,
@@ -47,7 +55,33 @@ def report(tx: Session, mission_id: str) -> dict[str, Any]:
         "delta": _deltas(rows),
         "latency_s": latency(frames.latencies_s(tx, mission_id)),
         "reprojection_rms_px": mission.reprojection_rms_px,
+        **({} if checked is None else {"checkpoints": checked}),
     }
+
+
+def _checkpoints(tx: Session, mission_id: str, rows: Sequence[Frame]) -> Mapping[str, Any] | None:
+    """How far the surveyed points lie off: through today's poses, in the mosaic as it was last measured."""
+    survey, points = surveys.get(tx, mission_id), surveys.checkpoints(tx, mission_id)
+    if survey is None or points is None:
+        return None
+    known = poses.load(tx, mission_id)
+    names = {row.id: row.name for row in rows if row.media_type is not None}
+    placed = [(names[k], p.posed(known.cameras)) for k, p in known.placed.items() if k in names]
+    found = checkpoints_document(points, known.world, by_name(placed), names.values(), survey.measured)
+    return found | {"mosaic_revision": (survey.measured or {}).get("revision")}
+
+
+def _scale(tx: Session, mission: Mission, rows: Sequence[Frame]) -> Mapping[str, Any] | None:
+    known = KnownScale.from_json(mission.scale)
+    if mission.scale is None:
+        return None
+    shown = [row.name for row in rows if row.state in ("posed", "fused")]
+    there = known.marker is None or named(known.marker.image, shown) is not None
+    return mission.scale | {"used": there and poses.georeferenced(tx, mission.id) is False}
+
+
+def _waiting(row: Frame) -> Mapping[str, Any]:
+    return {"name": row.name, "frame_id": row.id, "submap": (row.island or {}).get("submap")}
 
 
 def latency(seconds: Sequence[float]) -> dict[str, float] | None:

@@ -49,6 +49,7 @@ class Mission(Base):
     zoom: Mapped[int | None]  # of the native tiles
     cameras: Mapped[Json] = mapped_column(default=dict)  # camera_key → fields of core.geometry.Camera
     submaps: Mapped[Json | None]  # core.submaps.SubmapGraph.to_json() of the last solve
+    scale: Mapped[Json | None]  # core.scale.KnownScale.to_json()
     revision: Mapped[int] = mapped_column(default=0)  # last published
     generation: Mapped[int] = mapped_column(default=0)  # last saved poses
     event_seq: Mapped[int] = mapped_column(default=0)
@@ -81,7 +82,7 @@ class Frame(Base):
     media_type: Mapped[str | None]
     width: Mapped[int | None]
     height: Mapped[int | None]
-    state: Mapped[str]  # received | ready | matched | posed | fused | rejected
+    state: Mapped[str]  # received | ready | matched | posed | fused | waiting | rejected
     reason_code: Mapped[str | None]
     reason: Mapped[str | None]
     meta: Mapped[Json | None]  # core.frame.FrameMeta
@@ -93,6 +94,7 @@ class Frame(Base):
     fused_at: Mapped[float | None]
     woken_at: Mapped[float | None]
     attempts: Mapped[int] = mapped_column(default=0)  # how often a worker has begun to read it
+    island: Mapped[Json | None]  # core.geometry.Pose on the island of one that waits; None: it is alone
 
 
 class Pair(Base):
@@ -245,3 +247,4 @@ class Survey(Base):
     content: Mapped[str | None]
     used: Mapped[list[str]] = mapped_column(JSON(none_as_null=True))  # points that hold the map in place
     changed_at: Mapped[float]
+    measured: Mapped[Json | None]  # generation, revision, and what the mosaic of then says of the points

@@ -14,14 +14,23 @@ from core.cog import DEFAULT as MOSAIC
 from core.cog import mosaic_grid
 from core.coverage import mission_gsd_m
 from core.errors import NothingToMap, OrthostreamError
-from core.exports import NamedFrame, footprints_geojson, json_bytes, poses_document, route_csv, write_mosaic
+from core.exports import (
+    NamedFrame,
+    WaitingFrame,
+    footprints_geojson,
+    is_local,
+    json_bytes,
+    poses_document,
+    route_csv,
+    write_mosaic,
+)
 from core.geometry import PosedFrame, World
 from core.grid import TileKey, utm_epsg
 from core.preview import Preview, preview, write_preview
 from core.pyramid import JPEG
 from core.stac import stac_item
 from core.superoverlay import write_kmz
-from services.catalog import exports, frames, missions, poses, tiles
+from services.catalog import exports, frames, missions, poses, surveys, tiles
 from services.catalog.frames import Seen
 from services.catalog.poses import Poses
 from services.export_names import crs_of
@@ -126,7 +135,19 @@ def _mosaic(path: Path, mission: Mission, wanted: Export) -> None:
 
 
 def _poses(path: Path, mission: Mission, _wanted: Export) -> None:
-    path.write_bytes(json_bytes(poses_document(*_placed(mission))))
+    world, named = _placed(mission)
+    path.write_bytes(json_bytes(poses_document(world, named, _waiting(mission.id))))
+
+
+def _waiting(mission_id: str) -> list[WaitingFrame]:
+    """The frames that wait for a tie."""
+    known, seen = _known(mission_id)
+    cameras = {s.frame_id: known.cameras.get(s.meta.camera_key) or s.meta.camera() for s in seen}
+    return [
+        WaitingFrame(s.name, s.frame_id, cameras[s.frame_id], known.waiting[s.frame_id], s.meta.captured_s)
+        for s in seen
+        if s.frame_id in known.waiting
+    ]
 
 
 def _footprints(path: Path, mission: Mission, _wanted: Export) -> None:
@@ -139,12 +160,16 @@ def _route(path: Path, mission: Mission, _wanted: Export) -> None:
 
 def _report(path: Path, mission: Mission, _wanted: Export) -> None:
     with db.read() as tx:
-        document = report(tx, mission.id)
-    points = surveyed.points_of(mission.id)
-    if points is not None:
-        placed = _placed(mission) if mission.world else (None, [])
-        document["checkpoints"] = surveyed.measured(mission, points, *placed)
-    path.write_bytes(json_bytes(document))
+        survey = surveys.get(tx, mission.id)
+        points = surveys.checkpoints(tx, mission.id)
+        placed = poses.georeferenced(tx, mission.id) is not None
+    if survey is not None and points is not None and placed:
+        shown = surveyed.in_mosaic(mission, points, *_placed(mission))
+        as_of = {"revision": mission.revision, "generation": mission.generation}
+        with db.write() as tx:
+            surveys.keep_measured(tx, mission.id, survey.content, shown | as_of)
+    with db.read() as tx:
+        path.write_bytes(json_bytes(report(tx, mission.id)))
 
 
 def _stac(path: Path, mission: Mission, _wanted: Export) -> None:
@@ -154,7 +179,8 @@ def _stac(path: Path, mission: Mission, _wanted: Export) -> None:
     if gsd_m is None:
         raise NothingToMap
     grid = mosaic_grid(world, drawn, gsd_m, MOSAIC.max_pixels)
-    item = stac_item(mission.id, mission.name, world, named, grid, mission.created_at)
+    title = f"{mission.name} (not georeferenced)" if is_local(named) else mission.name
+    item = stac_item(mission.id, title, world, named, grid, mission.created_at)
     path.write_bytes(json_bytes(item))
 
 
@@ -164,7 +190,10 @@ def _tiles(mission: Mission, wanted: Export) -> TileSet:
         shown = {TileKey(*t.key): t for t in tiles.at(tx, mission.id, wanted.revision)}
     keys = {key: t.object_key for key, t in shown.items() if t.object_key is not None}
     kinds = {key: t.media_type or JPEG for key, t in shown.items()}
-    return TileSet(mission.name, kinds, lambda tile: store.get(keys[tile]))
+    with db.read() as tx:
+        local = poses.georeferenced(tx, mission.id) is False
+    title = f"{mission.name} (not georeferenced)" if local else mission.name
+    return TileSet(title, kinds, lambda tile: store.get(keys[tile]))
 
 
 def _archive(write: Callable[[Path, TileSet], None]) -> Maker:

@@ -9,11 +9,13 @@ import numpy as np
 
 from core import errors
 from core.coverage import moved_px, outline_px, shows_all_of, tiles_under
-from core.geometry import Array, PosedFrame
+from core.geometry import Array, Pose, PosedFrame
 from core.grid import TileKey, ancestors
-from core.mosaic import MOST_TILES, Layout
+from core.mosaic import MOST_TILES, Layout, waiting_frames
 from core.pose_graph import GraphFrame, Solution
+from core.pose_graph.survey import usable_fix
 from services.catalog.frames import Seen
+from services.catalog.pairs import Key as PairKey
 from services.catalog.poses import Placed, Poses, PoseUpdate
 from services.catalog.tiles import Key, TileBox
 
@@ -26,7 +28,12 @@ SHOWN_GAIN = 0.02
 
 @dataclass
 class Known:
-    """What the sequencer remembers of a mission between two batches; good as long as `generation` is."""
+    """What the sequencer remembers of a mission between two batches; good as long as `generation` is.
+
+    `solved_located`: frames with GPS in the last solve. `untried`: frames that have not looked for ties with
+    other maps yet; `tries`: pairs that were asked for in order to tie maps and are still being matched.
+    `tied`: maps were found to hang together since the last solve.
+    """
 
     generation: int
     layout: Layout | None
@@ -34,12 +41,18 @@ class Known:
     reprojection_rms_px: float = 0.0
     seen: dict[str, GraphFrame] = field(default_factory=dict)
     deferred: set[Key] = field(default_factory=set)
+    solved_located: int = 0
+    untried: set[str] = field(default_factory=set)
+    tries: set[PairKey] = field(default_factory=set)
+    tied: bool = False
 
     @classmethod
     def read(cls, poses: Poses, sightings: Iterable[Seen], rms_px: float | None) -> Known:
         """From the rows alone, as another sequencer left them."""
         seen = {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in sightings}
-        return cls(poses.generation, _layout(poses), poses.solved_frames, rms_px or 0.0, seen)
+        known = cls(poses.generation, _layout(poses), poses.solved_frames, rms_px or 0.0, seen)
+        known.solved_located = known.located(poses.placed)
+        return known
 
     @property
     def solution(self) -> Solution | None:
@@ -55,6 +68,23 @@ class Known:
         )
 
     @property
+    def waiting(self) -> Mapping[str, Pose | None]:
+        """The frames that wait for a tie."""
+        return self.layout.waiting if self.layout else {}
+
+    @property
+    def homes(self) -> dict[str, int | str]:
+        """Which connected map each frame is part of; one that ties to nothing is a map of its own."""
+        if self.layout is None:
+            return {}
+        poses = {k: f.pose for k, f in self.layout.frames.items()} | dict(self.layout.waiting)
+        return {k: k if p is None or p.source == "gnss" else p.submap for k, p in poses.items()}
+
+    def located(self, frame_ids: Iterable[str]) -> int:
+        """How many of these frames have GPS."""
+        return sum(usable_fix(self.seen[k].meta.gps) is not None for k in frame_ids if k in self.seen)
+
+    @property
     def camera_keys(self) -> dict[str, str]:
         """Frame id → camera key."""
         return {k: f.meta.camera_key for k, f in self.seen.items()}
@@ -67,15 +97,18 @@ def _layout(poses: Poses) -> Layout | None:
     under: dict[str, frozenset[TileKey]] = {}
     if poses.zoom is not None:
         under = {k: frozenset(tiles_under(f, poses.world, poses.zoom)) for k, f in frames.items()}
-    return Layout(poses.world, poses.zoom, poses.cameras, frames, under, {})
+    return Layout(poses.world, poses.zoom, poses.cameras, frames, under, {}, poses.waiting)
 
 
-def joined(layout: Layout, solution: Solution, new_ids: Collection[str], keys: Mapping[str, str]) -> Layout:
+def joined(
+    layout: Layout, solution: Solution, new_ids: Collection[str], keys: Mapping[str, str], mode: str
+) -> Layout:
     """The layout with new frames in it; those that are there stay as they are."""
     assert layout.zoom is not None
     cameras = dict(layout.cameras) | {k: c for k, c in solution.cameras.items() if k not in layout.cameras}
     frames, under = dict(layout.frames), dict(layout.under)
-    lost = sorted(set(new_ids) - solution.poses.keys())
+    late = {k: pose for k, pose in waiting_frames(solution, mode).items() if k in new_ids}
+    lost = sorted(set(new_ids) - solution.poses.keys() - late.keys())
     rejected = {k: solution.unplaced.get(k, errors.NotPlaceable.code) for k in lost}
     for frame_id in sorted(set(new_ids) & set(solution.poses)):
         camera = cameras[keys[frame_id]]
@@ -86,7 +119,8 @@ def joined(layout: Layout, solution: Solution, new_ids: Collection[str], keys: M
             frames[frame_id], under[frame_id] = frame, tiles
         else:
             rejected[frame_id] = "oblique"
-    return replace(layout, cameras=cameras, frames=frames, under=under, rejected=rejected)
+    waiting = {k: p for k, p in layout.waiting.items() if k not in new_ids} | late
+    return replace(layout, cameras=cameras, frames=frames, under=under, rejected=rejected, waiting=waiting)
 
 
 def _gain_nearby(frame: PosedFrame, others: Mapping[str, PosedFrame]) -> tuple[float, float, float]:
@@ -152,13 +186,17 @@ def everything(layout: Layout, published: Iterable[Key]) -> dict[Key, int]:
     return dict.fromkeys(cover, NEW) | {k: NEW for k in published if TileKey(*k) not in led_to}
 
 
-def update_of(layout: Layout, keys: Mapping[str, str], frame_ids: Collection[str]) -> PoseUpdate:
-    """The rows that say so, of some frames."""
+def update_of(layout: Layout, keys: Mapping[str, str], new_ids: Collection[str] | None = None) -> PoseUpdate:
+    """The rows that say so, of all frames or of those that are new."""
     assert layout.zoom is not None or not layout.frames
-    placed = [_placed(layout, keys, k) for k in sorted(set(frame_ids) & set(layout.frames))]
-    unplaced = {k: (code, sentence(code)) for k, code in layout.rejected.items()}
+    some = layout.frames.keys() | layout.waiting.keys() if new_ids is None else set(new_ids)
     return PoseUpdate(
-        placed=placed, unplaced=unplaced, cameras=layout.cameras, world=layout.world, zoom=layout.zoom
+        placed=[_placed(layout, keys, k) for k in sorted(some & layout.frames.keys())],
+        unplaced={k: (code, sentence(code)) for k, code in layout.rejected.items()},
+        waiting={k: layout.waiting[k] for k in sorted(some & layout.waiting.keys())},
+        cameras=layout.cameras,
+        world=layout.world,
+        zoom=layout.zoom,
     )
 
 

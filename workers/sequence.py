@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from core.matching import PairMatch
-from core.mosaic import lay_out, solved
-from core.neighbours import Sighting
+from core.mosaic import Layout, lay_out, solved
 from core.pose_graph import GraphFrame, Solution, place
+from core.scale import KnownScale
 from core.submaps import SubmapGraph, joins
 from core.ties import Canonical, canonical
 from services.catalog import backlog, frames, missions, pairs, poses, surveys, tiles
@@ -19,16 +19,17 @@ from services.catalog.poses import PoseUpdate
 from services.catalog.tiles import Key as TileId
 from services.queue import send
 from services.tables import Mission
-from workers import surveyed, warmup
+from workers import surveyed, tying, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
 from workers.lease import held
 from workers.photos import Pixels, shelf
 from workers.posing import DEFERRED, Known, changed, everything, joined, update_of
+from workers.tying import sighting
 
 GROWTH = 2.0
-"""All poses are solved again when the mission has grown so many times since the last time."""
+"""All poses are solved again when the mission, or its frames with GPS, grew so many times since the last."""
 MERGE_GROWTH = 1.02
-"""When new frames tie submaps that were apart, so much is enough."""
+"""When maps that were apart are tied, so much is enough, or a moment in which there is nothing else to do."""
 FEW = 8
 ASK_AGAIN_S = 10.0
 LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 12, 16, 24
@@ -37,6 +38,7 @@ WORTH_A_LOOK = 24
 REST_S = 4.0
 """Pause between live renders while photos wait to be read: the map grows, and takes little from reading."""
 _REMEMBERED = 8
+IDLE = Backlog(0, 0, 0, 0, 0)
 
 _known: dict[str, Known] = {}
 _asked: dict[tuple[str, PairKey], float] = {}
@@ -95,9 +97,11 @@ def _step(mission_id: str, epoch: int) -> bool:
     if new and (mission.state != "finalising" or desk.unread >= WORTH_A_LOOK):
         _pose(mission, epoch, {f.id for f in new})
         return True
+    if mission.state == "open" and mission.mode == "visual" and _tie(mission, epoch, desk):
+        return True
     if desk.to_render:
         return _dispatch(mission, desk)
-    if mission.state == "open" and desk == Backlog(0, 0, 0, 0, 0) and _catch_up(mission, epoch):
+    if mission.state == "open" and desk == IDLE and _catch_up(mission, epoch):
         return True
     if desk.to_publish and not desk.in_flight:
         send("publish", mission_id)  # normally the fuse task has: it may have died in between
@@ -129,33 +133,36 @@ def _learn(mission_id: str, known: Known, new_ids: set[str]) -> None:
         known.seen |= {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in seen}
 
 
+def _tie(mission: Mission, epoch: int, desk: Backlog) -> bool:
+    """Look for ties between maps; whether all was solved again because there are some."""
+    known = _known.get(mission.id)
+    if known is None or known.generation != mission.generation:
+        return False
+    known.tied |= bool(known.tries) and tying.tied(mission.id, known)
+    if known.tied and (desk == IDLE or len(known.homes) >= MERGE_GROWTH * known.solved_frames):
+        _pose(mission, epoch, set())
+        return True
+    if known.untried and desk.unread <= settings.workers:
+        ask = tying.look(mission.id, known)
+        for start in range(0, len(ask), PAIRS_PER_TASK):
+            send("match", mission.id, None, ask[start : start + PAIRS_PER_TASK])
+    return False
+
+
 def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
-    """Place what is new, or, when the mission has grown enough, solve all of it again."""
+    """Place what is new; or, when the mission has grown enough or nothing is new, solve all of it again."""
     clock = Stopwatch()
     known = _recall(mission)
     _learn(mission.id, known, new_ids)
-    posed = set(known.layout.frames) if known.layout else set()
-    total = len(posed | new_ids)
     before, solution = known.layout, known.solution
     matches = _matches(mission.id, new_ids)
-    if solution is None or total < FEW or total >= _enough(known, new_ids, matches):
-        # All that were ever read: what came since may tie in a frame that had no place before.
-        found, graph = _solve_all(mission, known)
-        found = surveyed.held(found, known.seen, surveyed.points_of(mission.id))
-        zoom_now = before.zoom if before is not None else None
-        after = lay_out(found, known.camera_keys, _thumb(mission.id), mission.max_side, zoom_now)
-        dirty = changed(before, after)
-        rezoomed = before is not None and before.zoom is not None and before.zoom != after.zoom
-        if rezoomed:
-            dirty = everything(after, _published(mission.id))
-        update = update_of(after, known.camera_keys, after.frames.keys())
-        rms_px = found.reprojection_rms_px
-        update = replace(update, solved_frames=total, reprojection_rms_px=rms_px, submaps=graph.to_json())
-        known.solved_frames, known.reprojection_rms_px = total, rms_px
+    if solution is None or not new_ids or _due(known, new_ids, matches):
+        after, dirty, update = _solved_again(mission, known)
     else:
         assert before is not None
-        found = place(solution, [known.seen[k] for k in sorted(posed | new_ids)], new_ids, matches)
-        after = joined(before, found, new_ids, known.camera_keys)
+        frames_here = [known.seen[k] for k in sorted(before.frames.keys() | new_ids)]
+        found = place(solution, frames_here, new_ids, matches)
+        after = joined(before, found, new_ids, known.camera_keys, mission.mode)
         dirty = changed(before, after)
         update = update_of(after, known.camera_keys, new_ids)
     later = {tile for tile, priority in dirty.items() if priority == DEFERRED}
@@ -164,15 +171,53 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
         generation = poses.save(tx, mission.id, epoch, replace(update, dirty=now))
         clock.spend(tx, mission.id, "pose")
     known.deferred = (known.deferred | later) - now.keys()
+    known.untried |= new_ids
     known.layout, known.generation = after, generation
     log.info("posed", mission=mission.id, new=len(new_ids), posed=len(after.frames), dirty=len(dirty))
 
 
-def _enough(known: Known, new_ids: set[str], matches: Sequence[PairMatch]) -> float:
-    """How many frames the mission must have for all to be solved again."""
-    placed = known.layout.frames if known.layout else {}
-    merged = {k: f.pose.submap for k, f in placed.items() if f.pose.source != "gnss"}
-    return (MERGE_GROWTH if joins(merged, new_ids, matches) else GROWTH) * known.solved_frames
+def _due(known: Known, new_ids: set[str], matches: Sequence[PairMatch]) -> bool:
+    """Whether all is to be solved again instead of placing what is new."""
+    homes = known.homes
+    total, located = len(homes.keys() | new_ids), known.located(homes.keys() | new_ids)
+    grown = total < FEW or total >= GROWTH * known.solved_frames
+    # Its first fixes place a map badly that was flown without GPS: twice as many place it better.
+    if grown or (located > 0 and located >= GROWTH * known.solved_located):
+        return True
+    maps = {k: home for k, home in homes.items() if home != k or k in known.waiting}
+    known.tied |= joins(maps, new_ids, matches) or _lifts(known, new_ids, matches)
+    return known.tied and total >= MERGE_GROWTH * known.solved_frames
+
+
+def _lifts(known: Known, new_ids: set[str], matches: Sequence[PairMatch]) -> bool:
+    """Whether new frames tie what has no place to a frame that GPS alone has placed so far."""
+    alone = new_ids | {k for k, home in known.homes.items() if home == k}
+    stuck = {k for k in (*known.waiting, *new_ids) if not known.located([k])}
+    fixed = {k for k in alone if known.located([k])}
+    ends = [(m.low, m.high) for m in matches if m.accepted and new_ids & {m.low, m.high}]
+    return any((a in stuck and b in fixed) or (b in stuck and a in fixed) for a, b in ends)
+
+
+def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, int], PoseUpdate]:
+    """All that were ever read: what came since may tie in a frame that had no place before."""
+    before = known.layout
+    found, graph = _solve_all(mission, known)
+    found = surveyed.held(found, known.seen, surveyed.points_of(mission.id))
+    zoom_now = before.zoom if before is not None else None
+    thumb = _thumb(mission.id)
+    after = lay_out(found, known.camera_keys, thumb, mission.max_side, zoom_now, mission.mode)
+    rezoomed = before is not None and before.zoom is not None and before.zoom != after.zoom
+    dirty = everything(after, _published(mission.id)) if rezoomed else changed(before, after)
+    total, rms_px = len(after.frames) + len(after.waiting), found.reprojection_rms_px
+    update = replace(
+        update_of(after, known.camera_keys),
+        solved_frames=total,
+        reprojection_rms_px=rms_px,
+        submaps=graph.to_json(),
+    )
+    known.solved_frames, known.reprojection_rms_px, known.tied = total, rms_px, False
+    known.solved_located = known.located(known.seen)
+    return after, dirty, update
 
 
 def _catch_up(mission: Mission, epoch: int) -> bool:
@@ -189,7 +234,8 @@ def _catch_up(mission: Mission, epoch: int) -> bool:
 
 def _solve_all(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:
     matches = _matches(mission.id, None) if mission.mode == "visual" else []
-    return solved([known.seen[k] for k in sorted(known.seen)], Canonical((), (), tuple(matches)))
+    scale = KnownScale.from_json(mission.scale)
+    return solved([known.seen[k] for k in sorted(known.seen)], Canonical((), (), tuple(matches)), scale)
 
 
 def _matches(mission_id: str, touching: set[str] | None) -> list[PairMatch]:
@@ -220,12 +266,12 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
     if pairs_of_all is None:
         return False
     points = surveyed.points_of(mission.id)
-    found, submaps = solved(list(graph.values()), pairs_of_all)
+    found, submaps = solved(list(graph.values()), pairs_of_all, KnownScale.from_json(mission.scale))
     found = surveyed.held(found, graph, points)
     keys = {k: f.meta.camera_key for k, f in graph.items()}
-    layout = lay_out(found, keys, _thumb(mission.id), mission.max_side)
+    layout = lay_out(found, keys, _thumb(mission.id), mission.max_side, mode=mission.mode)
     update = replace(
-        update_of(layout, keys, layout.frames.keys()),
+        update_of(layout, keys),
         dirty=everything(layout, _published(mission.id)),
         solved_frames=len(graph),
         reprojection_rms_px=found.reprojection_rms_px,
@@ -233,8 +279,10 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
         final=True,
     )
     with db.write() as tx:
-        if surveys.checkpoints(tx, mission.id) != points:
-            return True  # other points came meanwhile
+        if surveys.checkpoints(tx, mission.id) != points or (
+            missions.get(tx, mission.id).scale != mission.scale
+        ):
+            return True  # other points, or another scale, came meanwhile
         generation = poses.save(tx, mission.id, epoch, update)
         clock.spend(tx, mission.id, "solve")
     _known[mission.id] = Known(generation, layout, len(graph), found.reprojection_rms_px, graph)
@@ -246,17 +294,7 @@ def _canonical_pairs(mission: Mission, graph: Sequence[GraphFrame]) -> Canonical
     """None while some are not matched yet."""
     if mission.mode != "visual":
         return Canonical((), (), ())
-    sightings = [
-        Sighting(
-            f.frame_id,
-            f.meta.captured_s,
-            f.name,
-            f.meta.drone,
-            f.meta.gps,
-            shelf.words_of(mission.id, f.frame_id),
-        )
-        for f in graph
-    ]
+    sightings = [sighting(mission.id, f) for f in graph]
     return canonical(sightings, lambda wanted: _matched(mission.id, set(wanted)))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.alignment import aligned
-from core.checkpoints import Checkpoints, by_name, checkpoint_errors, observations, point_errors
+from core.checkpoints import Checkpoints, by_name, observations
 from core.cog import DEFAULT as MOSAIC
 from core.cog import mosaic_grid
 from core.coverage import mission_gsd_m
@@ -17,7 +17,7 @@ from core.exports import NamedFrame
 from core.fusion import FrameIndex, render
 from core.geometry import World
 from core.grid import UtmGrid
-from core.mosaic_points import checkpoints_document, look_up, mosaic_errors, mosaic_points
+from core.mosaic_points import look_up, mosaic_document, mosaic_errors, mosaic_points
 from core.outline import ground_outline
 from core.pose_graph import GraphFrame, Solution
 from services.catalog import surveys
@@ -40,18 +40,18 @@ def held(solution: Solution, graph: Mapping[str, GraphFrame], points: Checkpoint
     return aligned(solution, names, {k: f.meta.camera_key for k, f in graph.items()}, points)
 
 
-def measured(
-    mission: Mission, points: Checkpoints, world: World | None, named: Sequence[NamedFrame]
+def in_mosaic(
+    mission: Mission, points: Checkpoints, world: World, named: Sequence[NamedFrame]
 ) -> dict[str, Any]:
-    """What the report says of the points.
+    """Where the mosaic shows the points.
 
     Only the windows of the mosaic around them are drawn: pixel by pixel they are those of mosaic.tif.
     """
     frames = by_name((n.name, n.posed) for n in named)
-    seen = observations(points, world, frames) if world else []
+    seen = observations(points, world, frames)
     gsd_m = mission_gsd_m((n.posed for n in named), mission.max_side)
-    if world is None or gsd_m is None or not seen:
-        return checkpoints_document(points, None, None, {}, {})
+    if gsd_m is None or not seen:
+        return mosaic_document({}, None)
     grid = mosaic_grid(world, [n.posed for n in named], gsd_m, MOSAIC.max_pixels)
     photos = MissionPhotos(shelf, mission.id, mission.max_side)
     index = FrameIndex(n.posed for n in named if ground_outline(n.posed) is not None)
@@ -60,10 +60,4 @@ def measured(
         return render(window, world, index.overlapping(window, world), photos)
 
     shown = mosaic_points(points, look_up(seen, world, grid, picture, photos.photo), grid.epsg)
-    return checkpoints_document(
-        points,
-        checkpoint_errors(points, world, frames),
-        mosaic_errors(points, shown, grid.epsg),
-        point_errors(seen),
-        shown,
-    )
+    return mosaic_document(shown, mosaic_errors(points, shown, grid.epsg))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, cast
 
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field, model_validator
 from sqlalchemy.orm import Session
 
-from services.catalog import frames, missions
+from core.scale import LONGEST_M, KnownScale
+from services.catalog import frames, missions, poses
 from services.report import latency
 from services.tables import Export, Frame, Mission
 
-FrameState = Literal["received", "ready", "matched", "posed", "fused", "rejected"]
+FrameState = Literal["received", "ready", "matched", "posed", "fused", "waiting", "rejected"]
 MissionState = Literal["open", "finalising", "final", "deleting"]
 ExportState = Literal["available", "wanted", "ready", "failed"]
 Mode = Literal["visual", "gnss"]
@@ -24,6 +25,35 @@ def _one_line(text: str) -> str:
     return shown
 
 
+Pixel = tuple[Annotated[float, Field(allow_inf_nan=False)], Annotated[float, Field(allow_inf_nan=False)]]
+Metres = Annotated[float, Field(gt=0, lt=LONGEST_M, allow_inf_nan=False)]
+
+
+class MarkerIn(BaseModel):
+    """Something straight of known length on the ground, as one photo shows it."""
+
+    photo: Annotated[str, Field(min_length=1, max_length=1000, description="The photo's name")]
+    pixels: tuple[Pixel, Pixel] = Field(description="Its two ends, u and v in the original photo")
+    length_m: Metres
+
+
+class ScaleIn(BaseModel):
+    """What is known of the scale where GPS cannot tell it: one of the two, or neither."""
+
+    first_height_m: Metres | None = Field(None, description="Of the first photo above ground")
+    marker: MarkerIn | None = None
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> ScaleIn:
+        if self.first_height_m is not None and self.marker is not None:
+            raise ValueError("give a first height or a marker, not both")
+        return self
+
+    def known(self) -> KnownScale:
+        """As core knows it. Raises BadScale."""
+        return KnownScale.from_json(self.model_dump())
+
+
 class MissionIn(BaseModel):
     """A new mission. `mode`: visual (match photos) or gnss (position and heading only)."""
 
@@ -32,6 +62,7 @@ class MissionIn(BaseModel):
     max_side: Annotated[int, Field(ge=256, le=65535)] | None = Field(
         None, description="Longest side, in pixels, at which photos are drawn; null: as they are"
     )
+    scale: ScaleIn | None = Field(None, description="For photos without GPS; it can be given later as well")
 
 
 class Latency(BaseModel):
@@ -73,6 +104,11 @@ class MissionOut(BaseModel):
     state: MissionState
     created_at: float
     zoom: int | None
+    scale: ScaleIn | None
+    georeferenced: bool | None = Field(
+        description="Whether the map lies where GPS says; false: no photo has any, place and north are "
+        "assumed; null: there is no map yet"
+    )
     event_seq: int = Field(description="Number of the last event: listen from here on")
     url: str = Field(description="The live map's page")
     progress: ProgressOut
@@ -175,6 +211,8 @@ def mission_document(tx: Session, row: Mission, public_url: str) -> MissionOut:
         state=cast(MissionState, row.state),
         created_at=row.created_at,
         zoom=row.zoom,
+        scale=None if row.scale is None else ScaleIn.model_validate(row.scale),
+        georeferenced=poses.georeferenced(tx, row.id),
         event_seq=row.event_seq,
         url=f"{public_url}/missions/{row.id}",
         progress=progress_document(tx, row.id),

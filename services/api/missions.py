@@ -6,12 +6,14 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 
+from core.scale import UNKNOWN
 from services.api.context import MissionId, PublicUrl, Use
 from services.api.documents import (
     MissionIn,
     MissionOut,
     MissionPage,
     ProgressOut,
+    ScaleIn,
     mission_document,
     progress_document,
 )
@@ -25,7 +27,8 @@ router = APIRouter(tags=["missions"])
 def create_mission(body: MissionIn, response: Response, services: Use, public_url: PublicUrl) -> MissionOut:
     """A new, empty mission; its id is in the answer and in `Location`."""
     with services.db.write() as tx:
-        row = missions.create(tx, body.name, body.mode, body.max_side)
+        scale = body.scale.known() if body.scale else UNKNOWN
+        row = missions.create(tx, body.name, body.mode, body.max_side, scale=scale)
         document = mission_document(tx, row, public_url)
     response.headers["Location"] = f"/api/v1/missions/{row.id}"
     return document
@@ -57,6 +60,21 @@ def get_progress(mission_id: MissionId, services: Use) -> ProgressOut:
     """How far the mission has come."""
     with services.db.read() as tx:
         return progress_document(tx, mission_id)
+
+
+@router.put("/missions/{mission_id}/scale")
+def put_scale(mission_id: MissionId, body: ScaleIn, services: Use, public_url: PublicUrl) -> MissionOut:
+    """Say how large the ground is where no GPS tells: the height of the first photo, or a marker in any.
+
+    It takes the place of what was said before; `{}` takes it back. Where it moves poses that were solved
+    already, a final mission is open again: finalise it once more.
+    """
+    with services.db.write() as tx:
+        moves = missions.set_scale(tx, mission_id, body.known())
+        document = mission_document(tx, missions.get(tx, mission_id), public_url)
+    if moves:
+        services.send("sequence", mission_id)
+    return document
 
 
 @router.post("/missions/{mission_id}/finalise", status_code=202)

@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 from core.errors import (
     BadCheckpoints,
     BadCrs,
+    BadScale,
     BadTelemetry,
     FileTooLarge,
     NotAnImage,
@@ -93,6 +94,7 @@ STATUS: tuple[tuple[type[Exception], int], ...] = (
     (BadTelemetry, 422),
     (BadCheckpoints, 422),
     (BadCrs, 422),
+    (BadScale, 422),
     (NoPhotos, 422),
     (BadUpload, 400),
     (BadKey, 400),

@@ -20,6 +20,7 @@ from services.api.documents import FrameState, UploadedFrame, UploadOut
 from services.api.multipart import FormReader, ReceivedFile, clean_name
 from services.api.problems import AllRefused, BadUpload, NoPhotos, as_ours
 from services.catalog import frames, missions
+from services.catalog.frames import INTERNAL
 from services.errors import FrameNotFound, OutOfDisk
 from services.tables import Frame
 
@@ -191,10 +192,12 @@ def _keep(
     services: Services, mission_id: str, file: ReceivedFile, header: PhotoHeader, telemetry: Any
 ) -> UploadedFrame:
     known = _known(services, mission_id, file.frame_id)
-    if known is not None:
+    if known is not None and known.reason_code != INTERNAL:
         return _uploaded(known, file, created=False)
     assert file.path is not None  # the probe refuses what is larger than the limit
     services.store.put_file(f"missions/{mission_id}/photos/{file.frame_id}", file.path)
+    if known is not None:
+        return _tried_again(services, mission_id, file)
     with services.db.write() as tx:
         frame, created = frames.receive(
             tx, mission_id, file.frame_id, file.name, file.size_bytes, header.media_type, header.width,
@@ -203,6 +206,17 @@ def _keep(
     if created:
         services.send("ingest", mission_id, file.frame_id)
     return _uploaded(frame, file, created)
+
+
+def _tried_again(services: Services, mission_id: str, file: ReceivedFile) -> UploadedFrame:
+    """A photo that could not be read for a reason of ours has another try when it is sent again."""
+    with services.db.write() as tx:
+        again = frames.retry(tx, mission_id, file.frame_id)
+        frame = frames.get(tx, mission_id, file.frame_id)
+        result = _uploaded(frame, file, created=False)
+    if again:
+        services.send("ingest", mission_id, file.frame_id)
+    return result
 
 
 def _probe(services: Services, file: ReceivedFile) -> PhotoHeader:

@@ -1,4 +1,7 @@
-"""Frames: received → ready → matched → posed → fused, or rejected with a reason. Never backwards."""
+"""Frames: received → ready → matched → posed → fused, or rejected with a reason.
+
+One that ties to nothing that has a place is waiting: it is kept, and posed when another photo ties it in.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,12 @@ from services.catalog.wakes import Wake
 from services.errors import FrameNotFound
 from services.tables import Frame, Mission
 
-STATES = ("received", "ready", "matched", "posed", "fused", "rejected")
+STATES = ("received", "ready", "matched", "posed", "fused", "waiting", "rejected")
+WAITING, INTERNAL = "waiting", "internal"
+WHY_WAITING = (
+    "The photo has no GPS and shows nothing yet that a photo on the map shows. It is kept, and goes onto the "
+    "map as soon as another photo ties it in."
+)
 _WAKES_AT_ONCE = 200
 
 
@@ -159,8 +167,8 @@ def mark_posed(
     """Matched → posed; so is one that could not be placed before. The ids that changed."""
     lock(tx, mission_id)
     now = clock(now)
-    values = {"state": "posed", "posed_at": now, "reason_code": None, "reason": None}
-    changed = _set(tx, mission_id, sorted(frame_ids), ("matched",), values, or_unplaced=True)
+    values = {"state": "posed", "posed_at": now, "reason_code": None, "reason": None, "island": None}
+    changed = _set(tx, mission_id, sorted(frame_ids), ("matched", WAITING), values, or_unplaced=True)
     events.append_frames(tx, mission_id, "posed", changed, now)
     return changed
 
@@ -168,7 +176,9 @@ def mark_posed(
 def mark_unplaced(
     tx: Session, mission_id: str, reasons: Mapping[str, tuple[str, str]], now: float | None = None
 ) -> Sequence[str]:
-    """matched, posed or fused → rejected by the pose graph: {frame_id: (code, reason)}. The ids that changed.
+    """matched, posed, fused or waiting → rejected by the pose graph: {frame_id: (code, reason)}.
+
+    The ids that changed.
 
     Such a frame stays among `sightings`: more photos may tie it in after all.
     """
@@ -177,11 +187,53 @@ def mark_unplaced(
     changed: Sequence[str] = []
     for code, reason in sorted(set(reasons.values())):
         ids = sorted(f for f, why in reasons.items() if why == (code, reason))
-        values = {"state": "rejected", "reason_code": code, "reason": _clean(reason)}
-        some = _set(tx, mission_id, ids, ("matched", "posed", "fused"), values)
+        values = {"state": "rejected", "reason_code": code, "reason": _clean(reason), "island": None}
+        some = _set(tx, mission_id, ids, ("matched", "posed", "fused", WAITING), values)
         events.append_frames(tx, mission_id, "rejected", some, now, code=code)
         changed = [*changed, *some]
     return changed
+
+
+def mark_waiting(
+    tx: Session, mission_id: str, islands: Mapping[str, Mapping[str, Any] | None], now: float | None = None
+) -> Sequence[str]:
+    """matched, posed, fused or unplaced → waiting, each with its pose on its island. The ids that changed."""
+    lock(tx, mission_id)
+    values = {"state": WAITING, "reason_code": WAITING, "reason": WHY_WAITING}
+    states = ("matched", "posed", "fused")
+    changed = _set(tx, mission_id, sorted(islands), states, values, or_unplaced=True)
+    for some in chunks(sorted(islands)):
+        query = select(Frame).where(
+            Frame.mission_id == mission_id, Frame.id.in_(some), Frame.state == WAITING
+        )
+        for row in tx.scalars(query.execution_options(populate_existing=True)):
+            island = islands[row.id]
+            row.island = None if island is None else dict(island)
+    tx.flush()
+    events.append_frames(tx, mission_id, WAITING, changed, clock(now))
+    return changed
+
+
+def retry(tx: Session, mission_id: str, frame_id: str, now: float | None = None) -> bool:
+    """Rejected for a reason that was not the photo's → received. False when there is nothing to try again.
+
+    A final mission is open again.
+    """
+    mission = lock(tx, mission_id)
+    row = get(tx, mission_id, frame_id)
+    if (row.state, row.reason_code) != ("rejected", INTERNAL):
+        return False
+    row.state, row.reason_code, row.reason, row.attempts, row.woken_at = "received", None, None, 0, None
+    tx.flush()
+    _reopen(tx, mission, clock(now))
+    events.append_frames(tx, mission_id, "received", [frame_id], now)
+    return True
+
+
+def islands(tx: Session, mission_id: str) -> Mapping[str, Mapping[str, Any] | None]:
+    """The frames that wait, by id, each with its pose on its island; None for one that is alone."""
+    query = select(Frame.id, Frame.island).where(Frame.mission_id == mission_id, Frame.state == WAITING)
+    return {row.id: row.island for row in tx.execute(query.order_by(Frame.id))}
 
 
 def get(tx: Session, mission_id: str, frame_id: str) -> Frame:

@@ -10,7 +10,8 @@ from sqlalchemy import ColumnElement, exists, func, select, tuple_
 from sqlalchemy import delete as delete_rows
 from sqlalchemy.orm import Session
 
-from services.catalog import events, leases, tiles
+from core.scale import UNKNOWN, KnownScale
+from services.catalog import events, frames, leases, tiles
 from services.catalog.rows import clock, lock, mission
 from services.catalog.wakes import Wake
 from services.tables import DirtyTile, Frame, Mission, Tile
@@ -50,7 +51,12 @@ class Progress:
 
 
 def create(
-    tx: Session, name: str, mode: str = "visual", max_side: int | None = None, now: float | None = None
+    tx: Session,
+    name: str,
+    mode: str = "visual",
+    max_side: int | None = None,
+    now: float | None = None,
+    scale: KnownScale = UNKNOWN,
 ) -> Mission:
     """A new, empty mission. `mode`: visual or gnss; `max_side`: px to work on; None: all."""
     row = Mission(
@@ -62,6 +68,7 @@ def create(
         created_at=clock(now),
         cameras={},
         stage_seconds={},
+        scale=scale.to_json(),
     )
     tx.add(row)
     tx.flush()
@@ -119,6 +126,31 @@ def finish(tx: Session, mission_id: str, epoch: int, now: float | None = None) -
     return True
 
 
+def set_scale(tx: Session, mission_id: str, scale: KnownScale, now: float | None = None) -> bool:
+    """Keep what is known of the scale; whether poses depend on it that were solved already.
+
+    Then the mission is open again, or solves its final poses once more. Raises MissionNotFound.
+    """
+    row = lock(tx, mission_id)
+    if row.scale == scale.to_json():
+        return False
+    row.scale = scale.to_json()
+    tx.flush()
+    return reopen_if_solved(tx, row, clock(now))
+
+
+def reopen_if_solved(tx: Session, row: Mission, now: float) -> bool:
+    """Open again a mission any of whose photos has had a pose: the final ones were solved from less."""
+    posed = exists().where(Frame.mission_id == row.id, Frame.posed_at.is_not(None))
+    if not tx.scalar(select(posed)):
+        return False
+    row.final_generation = None
+    if row.state == "final":
+        row.state, row.finished_at = "open", None
+        events.append(tx, row.id, "mission", {"state": "open"}, now)
+    return True
+
+
 def delete(tx: Session, mission_id: str, now: float | None = None) -> None:
     """Hide the mission from everybody at once; `purge` follows when its objects are gone."""
     row = lock(tx, mission_id)
@@ -147,7 +179,7 @@ def progress(tx: Session, mission_id: str, now: float | None = None) -> Progress
     """How far the mission has come; raises MissionNotFound."""
     row = mission(tx, mission_id)
     by_state = select(Frame.state, func.count()).where(Frame.mission_id == mission_id).group_by(Frame.state)
-    counts = dict.fromkeys(("received", "ready", "matched", "posed", "fused", "rejected"), 0)
+    counts = dict.fromkeys(frames.STATES, 0)
     for state, count in tx.execute(by_state):
         counts[state] = count
     window = Frame.fused_at > clock(now) - _RATE_WINDOW_S

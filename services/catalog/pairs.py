@@ -154,6 +154,17 @@ def list(
     ]
 
 
+def verdicts(tx: Session, mission_id: str, keys: Collection[Key]) -> Mapping[Key, bool]:
+    """Those of these pairs that are computed, and whether each was accepted."""
+    found: dict[Key, bool] = {}
+    for some in chunks(sorted(keys)):
+        query = select(Pair.low, Pair.high, Pair.accepted).where(
+            Pair.mission_id == mission_id, Pair.state == "done", tuple_(Pair.low, Pair.high).in_(some)
+        )
+        found |= {(low, high): good for low, high, good in tx.execute(query)}
+    return found
+
+
 def summary(tx: Session, mission_id: str) -> PairSummary:
     """The mission's pairs, counted."""
     query = (

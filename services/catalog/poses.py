@@ -41,6 +41,7 @@ class PoseUpdate:
     """What one run of the sequencer decided. What is None, or not mentioned, stays as it is.
 
     `placed`: new and moved frames, unchanged ones are welcome. `unplaced`: frame_id → (code, sentence).
+    `waiting`: frames that wait for a tie, with the pose on their island; None for one that is alone.
     `dirty`: native tile → priority (0 first), all that now look different. `cameras`: refined, by key.
     `solved_frames`: frames in the global solve, when this was one; `submaps`: what it was made of. `final`:
     it was the canonical one.
@@ -48,6 +49,7 @@ class PoseUpdate:
 
     placed: Sequence[Placed] = ()
     unplaced: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    waiting: Mapping[str, Pose | None] = field(default_factory=dict)
     dirty: Mapping[Key, int] = field(default_factory=dict)
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     world: World | None = None
@@ -60,7 +62,10 @@ class PoseUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """The mission's poses as of `generation`; `placed` by frame id, in its order."""
+    """The mission's poses as of `generation`; `placed` by frame id, in its order.
+
+    `waiting`: as in PoseUpdate; empty when only a part of the map was read.
+    """
 
     generation: int
     world: World | None
@@ -69,6 +74,7 @@ class Poses:
     placed: Mapping[str, Placed]
     solved_frames: int
     final_generation: int | None
+    waiting: Mapping[str, Pose | None] = field(default_factory=dict)
 
 
 def save(tx: Session, mission_id: str, epoch: int, change: PoseUpdate, now: float | None = None) -> int:
@@ -83,8 +89,10 @@ def save(tx: Session, mission_id: str, epoch: int, change: PoseUpdate, now: floa
     row.woken_at = now
     _save_mission(row, change)
     _upsert(tx, mission_id, row.generation, change.placed)
-    _delete(tx, mission_id, sorted(change.unplaced))
+    _delete(tx, mission_id, sorted({*change.unplaced, *change.waiting}))
     frames.mark_unplaced(tx, mission_id, change.unplaced, now)
+    islands = {k: None if pose is None else _pose_document(pose) for k, pose in change.waiting.items()}
+    frames.mark_waiting(tx, mission_id, islands, now)
     frames.mark_posed(tx, mission_id, [p.frame_id for p in change.placed], now)
     tiles.mark_dirty(tx, mission_id, change.dirty, row.generation)
     return row.generation
@@ -111,7 +119,14 @@ def load(tx: Session, mission_id: str, box: TileBox | None = None) -> Poses:
         placed={p.frame_id: p for p in placed},
         solved_frames=row.solved_frames,
         final_generation=row.final_generation,
+        waiting=waiting(tx, mission_id) if box is None else {},
     )
+
+
+def waiting(tx: Session, mission_id: str) -> Mapping[str, Pose | None]:
+    """The frames that wait for a tie, by id, with the pose on their island; None for one that is alone."""
+    found = frames.islands(tx, mission_id)
+    return {k: None if island is None else _pose(island) for k, island in found.items()}
 
 
 def maps(tx: Session, mission_id: str) -> Mapping[int, Mapping[str, int]]:
@@ -126,6 +141,13 @@ def maps(tx: Session, mission_id: str) -> Mapping[int, Mapping[str, int]]:
     for submap, source, count in tx.execute(query):
         found.setdefault(submap, {})[source] = count
     return found
+
+
+def georeferenced(tx: Session, mission_id: str) -> bool | None:
+    """Whether the map lies where GPS says; None when nothing is placed."""
+    query = select(FramePose.source).where(FramePose.mission_id == mission_id)
+    some = tx.scalars(query.limit(1)).first()  # a map is local as a whole, or not at all
+    return None if some is None else some != "vision-only"
 
 
 def _save_mission(row: Mission, change: PoseUpdate) -> None:
@@ -183,30 +205,46 @@ def _delete(tx: Session, mission_id: str, frame_ids: Collection[str]) -> None:
 
 def _row(mission_id: str, placed: Placed) -> dict[str, Any]:
     pose, box = placed.pose, placed.box
+    return (
+        {
+            "mission_id": mission_id,
+            "frame_id": placed.frame_id,
+            "camera_key": placed.camera_key,
+            "gain": [float(g) for g in placed.gain],
+        }
+        | _pose_document(pose)
+        | {name: int(value) for name, value in asdict(box).items()}
+    )
+
+
+def _pose_document(pose: Pose) -> dict[str, Any]:
     return {
-        "mission_id": mission_id,
-        "frame_id": placed.frame_id,
-        "camera_key": placed.camera_key,
         "source": pose.source,
         "submap": int(pose.submap),
         "rotation": np.asarray(pose.world_R_cam, float).reshape(9).tolist(),
         "center": np.asarray(pose.center, float).reshape(3).tolist(),
         "ground_h_m": float(pose.ground_h_m),
         "sigma_m": None if pose.sigma_m is None else [float(s) for s in pose.sigma_m],
-        "gain": [float(g) for g in placed.gain],
-    } | {name: int(value) for name, value in asdict(box).items()}
+    }
+
+
+def _pose(document: Mapping[str, Any]) -> Pose:
+    sigma = document["sigma_m"]
+    return Pose(
+        world_R_cam=np.array(document["rotation"], float).reshape(3, 3),
+        center=np.array(document["center"], float),
+        ground_h_m=document["ground_h_m"],
+        source=document["source"],
+        submap=document["submap"],
+        sigma_m=None if sigma is None else (sigma[0], sigma[1], sigma[2]),
+    )
+
+
+_POSE_COLUMNS = ("source", "submap", "rotation", "center", "ground_h_m", "sigma_m")
 
 
 def _placed(row: FramePose) -> Placed:
-    sigma = row.sigma_m
-    pose = Pose(
-        world_R_cam=np.array(row.rotation, float).reshape(3, 3),
-        center=np.array(row.center, float),
-        ground_h_m=row.ground_h_m,
-        source=row.source,  # type: ignore[arg-type]  # only save() writes it
-        submap=row.submap,
-        sigma_m=None if sigma is None else (sigma[0], sigma[1], sigma[2]),
-    )
+    pose = _pose({name: getattr(row, name) for name in _POSE_COLUMNS})
     box = TileBox(row.z, row.x0, row.y0, row.x1, row.y1)
     gain = (row.gain[0], row.gain[1], row.gain[2])
     return Placed(row.frame_id, row.camera_key, pose, box, gain, row.generation)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from sqlalchemy import func, select
+from collections.abc import Mapping
+from typing import Any
+
 from sqlalchemy.orm import Session
 
 from core.checkpoints import Checkpoints, parse_gcp_list
-from services.catalog import events
+from services.catalog import missions
 from services.catalog.rows import clock, lock, mission
-from services.tables import Frame, Mission, Survey
+from services.tables import Survey
 
 
 def put(tx: Session, mission_id: str, content: str | None, used: list[str], now: float | None = None) -> bool:
@@ -28,13 +30,9 @@ def put(tx: Session, mission_id: str, content: str | None, used: list[str], now:
         return False
     moves = bool(before.used or used)
     before.content, before.used, before.changed_at = content, used, now
+    before.measured = None
     tx.flush()
-    solved = tx.scalar(
-        select(func.count()).where(Frame.mission_id == mission_id, Frame.posed_at.is_not(None))
-    )
-    if moves and solved:
-        _reopen(tx, row, now)
-    return bool(moves and solved)
+    return moves and missions.reopen_if_solved(tx, row, now)
 
 
 def get(tx: Session, mission_id: str) -> Survey | None:
@@ -51,9 +49,9 @@ def checkpoints(tx: Session, mission_id: str) -> Checkpoints | None:
     return parse_gcp_list(row.content).using(row.used)
 
 
-def _reopen(tx: Session, row: Mission, now: float) -> None:
-    row.final_generation = None  # what was solved as final knew other points
-    if row.state == "final":
-        row.state = "open"
-        row.finished_at = None
-        events.append(tx, row.id, "mission", {"state": "open"}, now)
+def keep_measured(tx: Session, mission_id: str, content: str | None, measured: Mapping[str, Any]) -> None:
+    """Remember what was found of the points in the mosaic, unless other points (`content`) came meanwhile."""
+    lock(tx, mission_id)
+    row = get(tx, mission_id)
+    if row is not None and row.content == content:
+        row.measured = dict(measured)

@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from core.checkpoints import Checkpoints, parse_gcp_list
 from core.errors import BadCheckpoints
 from services.cli.client import Client
+
+GcpFile = Annotated[Path | None, typer.Option(help="Surveyed points (ODM's gcp_list.txt) to check against.")]
+UsedPoints = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME[,NAME…]", help="Points of --gcp that enter the solution; the rest checks it."),
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +77,15 @@ def checkpoint_rows(checked: Mapping[str, Any] | None) -> list[tuple[str, str]]:
         if mosaic["found"]:
             found += f": {_errors(mosaic['raw_m'], mosaic['debiased_m'], mosaic['similarity_m'])}"
         rows.append(("checkpoints, mosaic", found))
-    return rows or [("checkpoints", "none of them is seen in a posed photo")]
+    lost = [(why, [p["point"] for p in checked["points"] if p["unseen"] == why]) for why in _UNSEEN]
+    rows += [("checkpoints, not seen", f"{', '.join(names)}: {_UNSEEN[why]}") for why, names in lost if names]
+    return rows
+
+
+_UNSEEN = {
+    "no_photo": "none of their photos is in the mission",
+    "not_posed": "none of their photos is on the map by its picture",
+}
 
 
 def _points(number: int) -> str:

@@ -81,10 +81,16 @@ class Client:
         if _problem(answer) != {"status": "ok"}:
             raise Refused(f"What answers at {self.url} is not orthostream. Is the address right?")
 
-    def create(self, name: str, mode: str, max_side: int | None) -> str:
-        """A new mission's id."""
-        body = {"name": name, "mode": mode, "max_side": max_side}
+    def create(
+        self, name: str, mode: str, max_side: int | None, scale: Mapping[str, Any] | None = None
+    ) -> str:
+        """A new mission's id. `scale`: as the API knows it."""
+        body = {"name": name, "mode": mode, "max_side": max_side, "scale": scale}
         return str(self._json("POST", "/missions", json=body)["id"])
+
+    def scale(self, mission_id: str, scale: Mapping[str, Any] | None) -> None:
+        """Says what is known of the scale; None takes it back."""
+        self._json("PUT", f"/missions/{mission_id}/scale", json=scale or {})
 
     def mission(self, mission_id: str) -> dict[str, Any] | None:
         """The mission's document, None when the server does not know it."""

@@ -168,7 +168,7 @@ def follow(
     while True:
         now = client.progress(mission_id)
         counts = now["counts"]
-        done = counts["rejected"]
+        done = counts["rejected"] + counts["waiting"]
         fused = counts["fused"] + done
         matched = fused + counts["posed"] + counts["matched"]
         screen.show(tally.sent, matched, fused)
@@ -195,7 +195,8 @@ def deliver(
     """Downloads the exports of a finished mission. Raises NothingToMap, with what was wrong."""
     if MOSAIC in fetch(client, mission_id, out, console, crs):
         return
-    lines = [f"  {f['name']}: {f['reason']}" for f in client.frames(mission_id, "rejected")]
+    useless = client.frames(mission_id, "rejected") + client.frames(mission_id, "waiting")
+    lines = [f"  {f['name']}: {f['reason']}" for f in useless]
     if tally:
         lines += [f"  {name}: {why}" for name, why in sorted(tally.unread.items())]
         lines += [f"  {name}: The same file as {first}." for name, first in sorted(tally.copies.items())]

@@ -18,10 +18,12 @@ import typer
 from rich.console import Console
 
 from core.errors import OrthostreamError
-from services.cli.checkpoints import read_survey, send_survey
+from core.scale import KnownScale
+from services.cli.checkpoints import GcpFile, UsedPoints, read_survey, send_survey
 from services.cli.client import Client
 from services.cli.flight import Photo, find_photos, left_out
 from services.cli.mapping import Screen, Tally, deliver, follow, upload_all
+from services.cli.scale import FirstHeight, MarkerText, read_scale
 from services.cli.serve import embedded_stack
 from services.cli.summary import listed, summary
 from services.errors import OutOfDisk
@@ -44,19 +46,14 @@ def run(
     mode: Annotated[
         str, typer.Option(help="visual: match photos; gnss: position and heading only.")
     ] = "visual",
-    gcp: Annotated[
-        Path | None, typer.Option(help="Surveyed points (ODM's gcp_list.txt) to check against.")
-    ] = None,
-    use_gcp: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME[,NAME…]", help="Points of --gcp that enter the solution; the rest checks it."
-        ),
-    ] = None,
+    gcp: GcpFile = None,
+    use_gcp: UsedPoints = None,
     max_side: Annotated[
         int | None,
         typer.Option(min=256, max=65535, help="Longest side in pixels to work on; all unless set."),
     ] = None,
+    first_height: FirstHeight = None,
+    marker: MarkerText = None,
     crs: Annotated[
         str | None, typer.Option(help="Of mosaic.tif, as EPSG:3857; else the flight's UTM zone.")
     ] = None,
@@ -75,6 +72,7 @@ def run(
         mosaic_in(crs)  # a wrong one shall not show after an hour's work
     console = Console(stderr=False)
     found = find_photos(photos, out)
+    scale = read_scale(first_height, marker, [p.name for p in found])
     _say_left_out(photos, console)
     survey = read_survey(gcp, use_gcp or [])
     make_writable(out / HOME)
@@ -82,7 +80,7 @@ def run(
         client = Client(url, say=lambda line: console.print(line, style="yellow", markup=False))
         try:
             client.greet()
-            mission_id = _mission(client, out / HOME, photos, mode, max_side)
+            mission_id = _mission(client, out / HOME, photos, mode, max_side, scale)
             send_survey(client, mission_id, survey)
             tally = map_photos(client, mission_id, found, out, console, 1 / pace if pace else 0.0, crs)
             summary(out, console, f"{client.url}/missions/{mission_id}" if keep or server else None, tally)
@@ -137,7 +135,9 @@ def _service(server: str | None, home: Path, console: Console) -> Iterator[str]:
         yield url
 
 
-def _mission(client: Client, home: Path, photos: Path, mode: str, max_side: int | None) -> str:
+def _mission(
+    client: Client, home: Path, photos: Path, mode: str, max_side: int | None, scale: KnownScale
+) -> str:
     """The mission of the run before, if it was about the same photos, else a new one."""
     path = home / "mission.json"
     wanted: dict[str, Any] = {"photos": str(photos.resolve()), "mode": mode, "max_side": max_side}
@@ -146,11 +146,12 @@ def _mission(client: Client, home: Path, photos: Path, mode: str, max_side: int 
     except (OSError, ValueError):
         before = {}
     if {k: before.get(k) for k in wanted} == wanted and client.mission(str(before["mission"])) is not None:
+        client.scale(str(before["mission"]), scale.to_json())
         return str(before["mission"])
     folder = photos.resolve()
     name = folder.parent.name if folder.name in ("images", "photos") else folder.name
     shown = os.fsencode(name).decode("utf-8", "replace")[:_NAME_CHARS]
-    mission_id = client.create(shown or "Mission", mode, max_side)
+    mission_id = client.create(shown or "Mission", mode, max_side, scale.to_json())
     home.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(wanted | {"mission": mission_id}))
     return mission_id

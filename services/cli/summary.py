@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,11 @@ from services.cli.mapping import SHOWN, Tally
 
 NAMED = 5
 
-_VISION_ONLY = (
-    "No photo has usable GPS: the map has its shape, but its place, scale and north are assumed. "
-    "Send positions (telemetry), or do not measure in it."
+_LOCAL = "Not georeferenced: no photo has usable GPS. The map has its shape; its place and north are assumed"
+_SCALED = f"{_LOCAL}; its scale comes from what you gave. Send positions (telemetry) to place it."
+_UNSCALED = (
+    f"{_LOCAL}, and so is its scale. Give --first-height or --marker, or send positions (telemetry); until "
+    "then do not measure in it."
 )
 
 
@@ -35,7 +37,8 @@ def summary(out: Path, console: Console, url: str | None, tally: Tally | None = 
     console.print(table)
     poses = json.loads((out / "poses.json").read_text())
     placed = poses["frames"] if report["mission"]["mode"] == "visual" else []
-    for line in [*_placement(placed), *_refusals(report["rejected"], tally or Tally())]:
+    notes = [*_placement(placed, report["scale"]), *_late(report["waiting"])]
+    for line in [*notes, *_refusals(report["rejected"], tally or Tally())]:
         # Names are data: one with brackets in it is no markup.
         console.print(line, style="yellow", highlight=False, markup=False, soft_wrap=True)
 
@@ -43,8 +46,9 @@ def summary(out: Path, console: Console, url: str | None, tally: Tally | None = 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     counts, latency = report["counts"], report.get("latency_s") or {}
     seconds = report.get("seconds")
+    late = f"{counts['waiting']} waiting, " if counts["waiting"] else ""
     rows = [
-        ("photos", f"{report['frames']} ({counts['fused']} on the map, {counts['rejected']} rejected)"),
+        ("photos", f"{report['frames']} ({counts['fused']} on the map, {late}{counts['rejected']} rejected)"),
         ("seconds", _number(seconds, "{:.1f}")),
         ("photos a second", _number(report["frames"] / seconds if seconds else None, "{:.2f}")),
         ("upload to tile", f"p50 {latency.get('p50', '–')} s, p95 {latency.get('p95', '–')} s"),
@@ -54,10 +58,20 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     return rows + checkpoint_rows(report.get("checkpoints"))
 
 
-def _placement(frames: Sequence[dict[str, Any]]) -> Iterable[str]:
+def _late(waiting: Sequence[dict[str, Any]]) -> Iterable[str]:
+    """The photos that wait for a tie."""
+    if waiting:
+        many = f"{len(waiting)} photos" if len(waiting) > 1 else "1 photo"
+        yield (
+            f"{many} without GPS wait for a tie, for no photo on the map shows the same ground: "
+            f"{listed([w['name'] for w in waiting])}. They are kept, and photos that overlap both place them."
+        )
+
+
+def _placement(frames: Sequence[dict[str, Any]], scale: Mapping[str, Any] | None) -> Iterable[str]:
     """What kind of poses the map is made of, where it is not the best kind."""
     if any(f["source"] == "vision-only" for f in frames):
-        yield _VISION_ONLY
+        yield _SCALED if scale and scale["used"] else _UNSCALED
     by_gps = [f["name"] for f in frames if f["source"] == "gnss"]
     if by_gps and len(frames) > 1:
         yield (

@@ -25,16 +25,16 @@ from core.checkpoints import (
     Checkpoints,
     by_name,
     checkpoint_errors,
+    checkpoints_document,
     observations,
     parse_gcp_list,
-    point_errors,
 )
 from core.cog import flight_gsd_m, mosaic_grid, write_mosaic
 from core.errors import BadCheckpoints
 from core.fusion import FrameIndex, render
 from core.geometry import Array, Camera, Pose, PosedFrame, World
 from core.grid import UtmGrid
-from core.mosaic_points import Lookup, checkpoints_document, look_up, mosaic_errors, mosaic_points
+from core.mosaic_points import Lookup, look_up, mosaic_document, mosaic_errors, mosaic_points
 from core.pose_graph import Solution
 
 CAMERA = Camera(400, 300, 300.0, 199.5, 149.5, k1=-0.02)
@@ -228,16 +228,27 @@ def test_the_report_names_every_point(found: list[Lookup]) -> None:
     ]
     points = parse_gcp_list("\n".join(["EPSG:32632", *rows, f"{east} {north} 3 5 5 gone.jpg far"])).using("b")
     shown = mosaic_points(points, found, GRID.epsg)
-    seen = observations(points, WORLD, frames_of(FLIGHT))
-    poses = checkpoint_errors(points, WORLD, frames_of(FLIGHT))
-    inside = mosaic_errors(points, shown, GRID.epsg)
-    document = json.loads(
-        json.dumps(checkpoints_document(points, poses, inside, point_errors(seen), shown), allow_nan=False)
-    )
+    inside = mosaic_document(shown, mosaic_errors(points, shown, GRID.epsg))
+    posed = frames_of(FLIGHT)
+    told = checkpoints_document(points, WORLD, posed, posed, inside)
+    document = json.loads(json.dumps(told, allow_nan=False))
     assert [p["point"] for p in document["points"]] == sorted(names)
     assert [p["point"] for p in document["points"] if p["used"]] == ["b"]
-    assert document["points"][-1] == {"point": "far", "used": False, "poses": None, "mosaic": None}
+    nowhere = {"point": "far", "used": False, "poses": None, "mosaic": None, "unseen": "no_photo"}
+    assert document["points"][-1] == nowhere
+    assert {p["unseen"] for p in document["points"][:-1]} == {None}
     assert (document["poses"]["points"], document["mosaic"]["points"]) == (4, 4)  # b does not check itself
+
+
+def test_a_point_that_is_not_seen_says_why() -> None:
+    points, posed = survey(), frames_of(FLIGHT)
+    for frames, here, why in (({}, posed, "not_posed"), ({}, (), "no_photo"), (posed, posed, None)):
+        told = checkpoints_document(points, WORLD, frames, here, None)
+        assert {p["unseen"] for p in told["points"]} == {why}
+        assert (told["poses"] is None, told["mosaic"]) == (why is not None, None)
+    by_gps = {k: replace(f, pose=replace(f.pose, source="gnss")) for k, f in posed.items()}
+    told = checkpoints_document(points, None, by_gps, by_gps, None)
+    assert {p["unseen"] for p in told["points"]} == {"not_posed"}
 
 
 # ---- the map laid onto points

@@ -181,6 +181,7 @@ class TestMissions:
             "matched": 1,
             "posed": 0,
             "fused": 0,
+            "waiting": 0,
             "rejected": 1,
         }
         assert (progress.frames, progress.revision, progress.tiles, progress.dirty) == (3, 1, 1, 1)

@@ -172,7 +172,7 @@ def test_a_mission_without_photos_or_without_a_place_ends_too(bench: Any) -> Non
     bench.drain()
     assert bench.state == "final"
     with bench.db.read() as tx:
-        assert [f.reason_code for f in frames.list(tx, bench.mission_id)] == ["not_placeable"]
+        assert [f.state for f in frames.list(tx, bench.mission_id)] == ["waiting"]
     with bench.db.write() as tx:
         exports.request(tx, bench.mission_id, "mosaic.tif")
     bench.handle("export", bench.mission_id, "mosaic.tif")

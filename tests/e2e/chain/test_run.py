@@ -82,8 +82,9 @@ def test_bad_files_are_named_and_the_rest_is_mapped(flight: Path, tmp_path: Path
         "empty.jpg": "empty_file",
         "notes.jpg": "not_an_image",
         "torn.jpg": "truncated_image",
-        "nowhere.jpg": "not_placeable",
     }
+    assert [w["name"] for w in report["waiting"]] == ["nowhere.jpg"]
+    assert "wait for a tie" in done.stdout
     for name in codes:
         assert f"rejected {name}" in done.stdout
     assert report["counts"]["fused"] == 14

@@ -94,9 +94,15 @@ def test_names_on_the_command_line_are_parted_by_commas(tmp_path: Path) -> None:
 
 def test_the_summary_says_what_was_found() -> None:
     assert checkpoint_rows(None) == []
-    points = [{"point": "P1", "used": True}, {"point": "P2", "used": False}]
-    nothing: dict[str, Any] = {"points": points[1:], "poses": None, "mosaic": None}
-    assert "none" in checkpoint_rows(nothing)[0][1]
+    points = [{"point": "P1", "used": True, "unseen": None}, {"point": "P2", "used": False, "unseen": None}]
+    lost = [
+        {"point": f"P{k}", "used": False, "unseen": why} for k, why in enumerate(("no_photo", "not_posed"))
+    ]
+    nothing: dict[str, Any] = {"points": lost, "poses": None, "mosaic": None}
+    assert checkpoint_rows(nothing) == [
+        ("checkpoints, not seen", "P0: none of their photos is in the mission"),
+        ("checkpoints, not seen", "P1: none of their photos is on the map by its picture"),
+    ]
     unknown = {"plane_debiased_m": None, "plane_similarity_m": None}
     poses = {"points": 1, "sightings": 4, "plane_raw_m": 1.234} | unknown
     mosaic = {"points": 1, "found": 0, "raw_m": None, "debiased_m": None, "similarity_m": None}

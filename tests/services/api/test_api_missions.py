@@ -229,7 +229,7 @@ def test_the_report_adds_up(api: TestClient, services: Services, mission_url: st
     api.post(f"{mission_url}/frames", files=[("files", ("notes.txt", b"hello"))])
     known = api.get(f"{mission_url}/report").json()
     assert known["frames"] == 3
-    assert known["counts"] == {"received": 0, "ready": 0, "matched": 0, "posed": 0, "fused": 2, "rejected": 1}
+    assert {state: n for state, n in known["counts"].items() if n} == {"fused": 2, "rejected": 1}
     (rejected,) = known["rejected"]
     assert (rejected["name"], rejected["code"]) == ("notes.txt", "not_an_image")
     assert 0 <= known["latency_s"]["p50"] <= known["latency_s"]["p95"]

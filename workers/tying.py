@@ -1,0 +1,46 @@
+"""Ties between maps, looked for while drones still fly: a few pairs for every frame."""
+
+from __future__ import annotations
+
+from core.neighbours import Sighting
+from core.pose_graph import GraphFrame
+from core.ties import live_ties
+from services.catalog import pairs
+from services.catalog.pairs import Key as PairKey
+from workers.app import db
+from workers.photos import shelf
+from workers.posing import Known
+
+LOOKING = 32
+"""Frames that look for ties at a time."""
+
+
+def sighting(mission_id: str, frame: GraphFrame) -> Sighting:
+    """A frame as the search for partners sees it."""
+    meta, words = frame.meta, shelf.words_of(mission_id, frame.frame_id)
+    return Sighting(frame.frame_id, meta.captured_s, frame.name, meta.drone, meta.gps, words)
+
+
+def look(mission_id: str, known: Known) -> list[PairKey]:
+    """Pairs that may tie two maps, for some frames that have not looked yet; they are kept as `tries`."""
+    homes = known.homes
+    if len(set(homes.values())) < 2:
+        known.untried.clear()
+        return []
+    seekers = sorted(known.untried)[:LOOKING]
+    known.untried -= set(seekers)
+    with db.read() as tx:
+        tried = pairs.keys(tx, mission_id)
+    everyone = [sighting(mission_id, known.seen[k]) for k in sorted(homes) if k in known.seen]
+    found = live_ties(seekers, everyone, homes, tried)
+    known.tries |= set(found)
+    return found
+
+
+def tied(mission_id: str, known: Known) -> bool:
+    """Whether a pair that was tried, and is matched by now, ties two maps."""
+    with db.read() as tx:
+        verdicts = pairs.verdicts(tx, mission_id, known.tries)
+    known.tries -= verdicts.keys()
+    homes = known.homes
+    return any(good and homes.get(a) != homes.get(b) for (a, b), good in verdicts.items())
