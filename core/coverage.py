@@ -89,6 +89,12 @@ def block_grid(tiles: Sequence[TileKey]) -> MercatorGrid:
     return MercatorGrid(tiles[0].z, min(xs) * TILE_PX, min(ys) * TILE_PX, width * TILE_PX, height * TILE_PX)
 
 
+def pass_pixels(tiles: Iterable[TileKey]) -> int:
+    """How many pixels drawing all these tiles once takes."""
+    grids = [block_grid(block) for block in blocks(tiles)]
+    return sum(grid.width * grid.height for grid in grids)
+
+
 def draw_block(
     tiles: Sequence[TileKey],
     world: World,

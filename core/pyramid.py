@@ -72,8 +72,9 @@ def encode(rgba: Rgba, quality: int = QUALITY) -> tuple[bytes, str] | None:
             pixels, quality=quality, colorspace="RGBX", colorsubsampling="420"
         ), JPEG
     out = io.BytesIO()
-    # method 0: four times faster than the default for a tenth more bytes.
-    Image.fromarray(rgba, "RGBA").save(out, "WEBP", quality=quality, method=0)
+    # method 1: a third of the bytes less than method 0, which hardly packs the alpha, and three times as fast
+    # as the default for a twentieth more.
+    Image.fromarray(rgba, "RGBA").save(out, "WEBP", quality=quality, method=1)
     return out.getvalue(), WEBP
 
 

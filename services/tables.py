@@ -43,7 +43,8 @@ class Mission(Base):
     name: Mapped[str]
     mode: Mapped[str]  # visual | gnss
     max_side: Mapped[int | None]
-    state: Mapped[str] = mapped_column(default="open", index=True)  # open | finalising | final | deleting
+    # open | finalising | sharpening | final | deleting
+    state: Mapped[str] = mapped_column(default="open", index=True)
     created_at: Mapped[float]
     world: Mapped[Json | None]  # lat_deg, lon_deg, alt_m
     zoom: Mapped[int | None]  # of the native tiles
@@ -61,6 +62,18 @@ class Mission(Base):
     finished_at: Mapped[float | None]
     stage_seconds: Mapped[Json] = mapped_column(default=dict)  # stage → seconds of work spent
     woken_at: Mapped[float | None]
+    healed_generation: Mapped[int | None]  # the poses from which all tiles were last marked to be drawn
+    pixels: Mapped[Json] = mapped_column(default=dict)  # rendered so far: new, heal, final, sharpen
+    pass_pixels: Mapped[int | None] = mapped_column(BigInteger)  # what one pass over all tiles takes
+    backfill: Mapped[bool] = mapped_column(default=False)  # drawn at full resolution once it is final
+    full: Mapped[bool] = mapped_column(default=False)  # that has happened: `max_side` no longer counts
+    sharp_zoom: Mapped[int | None]  # of the tiles that are being drawn at full resolution
+    sharp_tiles: Mapped[int | None]  # how many these are
+
+    @property
+    def drawn_side(self) -> int | None:
+        """The longest side, in pixels, at which photos are drawn; None: as they are."""
+        return None if self.full else self.max_side
 
 
 class Frame(Base):
@@ -154,7 +167,10 @@ class Lease(Base):
 
 
 class Tile(Base):
-    """What a tile shows now. No object: it is empty."""
+    """What a tile shows now. No object: it is empty.
+
+    `inputs`: a digest of all that it was drawn from; None for overviews and for what was drawn in parts.
+    """
 
     __tablename__ = "tiles"
 
@@ -168,6 +184,7 @@ class Tile(Base):
     etag: Mapped[str | None]
     media_type: Mapped[str | None]
     size_bytes: Mapped[int] = mapped_column(default=0)
+    inputs: Mapped[str | None]
 
 
 class TileVersion(Base):

@@ -129,8 +129,8 @@ def _placed(mission: Mission) -> tuple[World, list[NamedFrame]]:
 def _mosaic(path: Path, mission: Mission, wanted: Export) -> None:
     world, named = _placed(mission)
     drawn: list[PosedFrame] = [n.posed for n in named]
-    gsd_m = mission_gsd_m(drawn, mission.max_side)
-    photos = MissionPhotos(shelf, mission.id, mission.max_side)
+    gsd_m = mission_gsd_m(drawn, mission.drawn_side)
+    photos = MissionPhotos(shelf, mission.id, mission.drawn_side)
     write_mosaic(path, world, drawn, photos, gsd_m, crs_of(wanted.name))
 
 
@@ -175,7 +175,7 @@ def _report(path: Path, mission: Mission, _wanted: Export) -> None:
 def _stac(path: Path, mission: Mission, _wanted: Export) -> None:
     world, named = _placed(mission)
     drawn: list[PosedFrame] = [n.posed for n in named]
-    gsd_m = mission_gsd_m(drawn, mission.max_side)
+    gsd_m = mission_gsd_m(drawn, mission.drawn_side)
     if gsd_m is None:
         raise NothingToMap
     grid = mosaic_grid(world, drawn, gsd_m, MOSAIC.max_pixels)

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
-from core.coverage import Encoded, blocks, draw_block
+from core.coverage import FUSION, Encoded, block_grid, blocks, draw_block
+from core.fusion import FrameIndex
 from core.grid import TileKey
+from core.inputs import frame_digest, tile_inputs
+from core.patching import fill_block
 from services.catalog import backlog, missions, poses, tiles
+from services.catalog.backlog import ToDraw
 from services.catalog.poses import Poses
-from services.catalog.tiles import TileBox
+from services.catalog.tiles import Key, Render, TileBox
 from services.queue import send
+from services.tables import Mission
 from workers import warmup
-from workers.app import Stopwatch, before_the_fork, db, stage, store
+from workers.app import Stopwatch, before_the_fork, db, settings, stage, store
 from workers.photos import MissionPhotos, shelf
-from workers.pictures import put_tile
+from workers.pictures import Pictures, put_tile
 
 before_the_fork(warmup.rendering)
+
+pictures = Pictures(store, settings.tile_cache_bytes // 2)
 
 
 @stage("fuse")
@@ -25,16 +33,14 @@ def fuse(mission_id: str, keys: Sequence[Sequence[int]]) -> None:
     for claimed in blocks(TileKey(*key) for key in keys):
         with db.read() as tx:
             wanted = backlog.unrendered(tx, mission_id, claimed)
-            block = [TileKey(*key) for key in wanted]
-            if not block:
+            if not wanted:
                 continue  # this task ran before, or somebody else was faster
             mission = missions.get(tx, mission_id)
-            known = poses.load(tx, mission_id, _box(block))
-        photos = MissionPhotos(shelf, mission_id, mission.max_side)
-        pictures = drawn(block, known, photos)
-        renders = [put_tile(store, mission_id, wanted[t], t, p) for t, p in pictures.items()]
+            known = poses.load(tx, mission_id, _box([TileKey(*key) for key in wanted]))
+        renders, pixels = drawn(mission, known, wanted)
         with db.write() as tx:
             tiles.record_renders(tx, mission_id, renders)
+            missions.count_pixels(tx, mission_id, pixels)
             clock.spend(tx, mission_id, "fuse")
     send("publish", mission_id)
 
@@ -44,9 +50,71 @@ def _box(block: Sequence[TileKey]) -> TileBox:
     return TileBox(block[0].z, min(xs), min(ys), max(xs), max(ys))
 
 
-def drawn(block: Sequence[TileKey], known: Poses, photos: MissionPhotos) -> dict[TileKey, Encoded | None]:
-    """The block's tiles; those of another zoom than the mission's are empty (publish makes overviews)."""
+def drawn(
+    mission: Mission, known: Poses, wanted: Mapping[Key, ToDraw]
+) -> tuple[list[Render], dict[str, int]]:
+    """The block's tiles, and how many pixels were rendered for what.
+
+    Tiles of another zoom than the mission's are empty (publish makes overviews).
+    """
+    block = [TileKey(*key) for key in wanted]
     if known.world is None or known.zoom != block[0].z or not known.placed:
-        return dict.fromkeys(block)
+        return [Render(tile, wanted[tile].generation) for tile in block], {}
+    whole = [tile for tile in block if wanted[tile].whole]
+    parts = [tile for tile in block if not wanted[tile].whole]
+    anew, redrawn = _redrawn(mission, known, whole, wanted)
+    filled, added = _filled(mission, known, parts, wanted)
+    kind = "heal" if mission.final_generation is None else "final"
+    return [*anew, *filled], {kind: redrawn, "new": added}
+
+
+def _redrawn(
+    mission: Mission, known: Poses, block: Sequence[TileKey], wanted: Mapping[Key, ToDraw]
+) -> tuple[list[Render], int]:
+    """The tiles drawn as a whole, but for those that show what they were drawn from already."""
+    assert known.world is not None
     frames = [p.posed(known.cameras) for p in known.placed.values()]
-    return draw_block(block, known.world, frames, photos)
+    digests = {f.frame_id: frame_digest(f) for f in frames}
+    done, inputs = [], dict[TileKey, str]()
+    for tile in block:
+        near = [digests[k] for k, p in known.placed.items() if _touches(p.box, tile)]
+        inputs[tile] = tile_inputs(tile, known.world, mission.drawn_side, near, FUSION)
+        shown = wanted[tile].shown
+        if shown is not None and shown.inputs == inputs[tile]:
+            done.append(replace(shown, generation=wanted[tile].generation))
+    left = [tile for tile in block if tile not in {TileKey(*r.key) for r in done}]
+    if not left:
+        return done, 0
+    photos = MissionPhotos(shelf, mission.id, mission.drawn_side)
+    found = draw_block(left, known.world, FrameIndex(frames, FUSION), photos)
+    made = [put_tile(store, mission.id, wanted[t].generation, t, p, inputs[t]) for t, p in found.items()]
+    grid = block_grid(left)
+    return [*done, *made], grid.width * grid.height
+
+
+def _touches(box: TileBox, tile: TileKey) -> bool:
+    return box.z == tile.z and box.x0 <= tile.x <= box.x1 and box.y0 <= tile.y <= box.y1
+
+
+def _filled(
+    mission: Mission, known: Poses, block: Sequence[TileKey], wanted: Mapping[Key, ToDraw]
+) -> tuple[list[Render], int]:
+    """The tiles with what they did not show yet drawn beside what they show."""
+    if not block:
+        return [], 0
+    assert known.world is not None
+    shown = {tile: pictures.get(_key(wanted[tile].shown)) for tile in block}
+    index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], FUSION)
+    photos = MissionPhotos(shelf, mission.id, mission.drawn_side)
+    patched = fill_block(shown, known.world, index, photos)
+    return [_patch(mission.id, tile, wanted[tile], patched.changed) for tile in block], patched.pixels
+
+
+def _patch(mission_id: str, tile: TileKey, todo: ToDraw, changed: Mapping[TileKey, Encoded | None]) -> Render:
+    if tile in changed:
+        return put_tile(store, mission_id, todo.generation, tile, changed[tile])
+    return replace(todo.shown or Render(tile, todo.generation), generation=todo.generation)
+
+
+def _key(shown: Render | None) -> str | None:
+    return shown.object_key if shown else None

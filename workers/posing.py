@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -17,11 +18,8 @@ from core.pose_graph.survey import usable_fix
 from services.catalog.frames import Seen
 from services.catalog.pairs import Key as PairKey
 from services.catalog.poses import Placed, Poses, PoseUpdate
-from services.catalog.tiles import Key, TileBox
+from services.catalog.tiles import GROWN, HEAL, NEW, Key, TileBox
 
-NEW, GROWN, HEAL, DEFERRED = 0, 1, 5, 9
-"""Priorities of dirty tiles: where nothing was shown yet, where ground was added, where poses moved, and
-where a photo only shows better what is shown already: that waits until nothing else is to be done."""
 SHOWN_MOVE_PX = 0.5
 SHOWN_GAIN = 0.02
 
@@ -40,7 +38,6 @@ class Known:
     solved_frames: int
     reprojection_rms_px: float = 0.0
     seen: dict[str, GraphFrame] = field(default_factory=dict)
-    deferred: set[Key] = field(default_factory=set)
     solved_located: int = 0
     untried: set[str] = field(default_factory=set)
     tries: set[PairKey] = field(default_factory=set)
@@ -132,30 +129,42 @@ def _gain_nearby(frame: PosedFrame, others: Mapping[str, PosedFrame]) -> tuple[f
     return same[int(((centers - frame.pose.center) ** 2).sum(1).argmin())].gain
 
 
-def changed(before: Layout | None, after: Layout) -> dict[Key, int]:
-    """Native tiles that look different now, each with its priority: DEFERRED where there is no new ground."""
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What another layout changes. `new`: tiles with ground that is not shown yet, each with its priority;
+    `off_px`: of the other tiles, how far from its place what they show is, in their pixels.
+    """
+
+    new: Mapping[Key, int]
+    off_px: Mapping[Key, float]
+
+    def dirty(self, most_healed: int) -> dict[Key, int]:
+        """The tiles to draw now: all that are new, and as many as that of those that are farthest off."""
+        worst = sorted(self.off_px, key=lambda tile: (-self.off_px[tile], tile))
+        return dict(self.new) | dict.fromkeys(worst[:most_healed], HEAL)
+
+
+def changed(before: Layout | None, after: Layout) -> Changes:
+    """The native tiles that look different now. Where a photo shows no new ground, nothing does: what it
+    shows better waits for the next pass over all tiles.
+    """
     if before is None or before.zoom is None:
-        return dict.fromkeys(after.cover, NEW)
+        return Changes(dict.fromkeys(after.cover, NEW), {})
     shown = before.cover
-    dirty: dict[Key, int] = {}
+    off_px: dict[Key, float] = {}
     news: set[TileKey] = set()
-
-    def touch(tiles: Iterable[TileKey], priority: int) -> None:
-        for tile in tiles:
-            dirty[tile] = min(dirty.get(tile, DEFERRED), priority)
-
     for frame_id in sorted(before.frames.keys() | after.frames.keys()):
         old, new = before.frames.get(frame_id), after.frames.get(frame_id)
         if new is not None and old is None:
             news |= after.under[frame_id]
-        elif new is None:
-            touch(before.under[frame_id], HEAL)
-        elif old is not None and _looks_other(old, new, before, after):
-            touch(before.under[frame_id] | after.under[frame_id], HEAL)
-    full = _full(news & shown, before)
-    touch(full, DEFERRED)
-    touch(news - full, GROWN)
-    return {tile: NEW if tile not in shown else priority for tile, priority in dirty.items()}
+        elif old is not None and (off := _off_px(old, new, before, after)) > SHOWN_MOVE_PX:
+            for tile in before.under[frame_id] | after.under.get(frame_id, frozenset()):
+                off_px[tile] = max(off_px.get(tile, 0.0), off)
+    news |= {TileKey(*tile) for tile in off_px} - shown
+    new_tiles: dict[Key, int] = {
+        tile: GROWN if tile in shown else NEW for tile in news - _full(news & shown, before)
+    }
+    return Changes(new_tiles, {tile: off for tile, off in off_px.items() if tile not in new_tiles})
 
 
 def _full(tiles: set[TileKey], layout: Layout) -> set[TileKey]:
@@ -171,12 +180,16 @@ def _full(tiles: set[TileKey], layout: Layout) -> set[TileKey]:
     return {tile for tile in tiles if shows_all_of(tile, outlines[tile])}
 
 
-def _looks_other(old: PosedFrame, new: PosedFrame, before: Layout, after: Layout) -> bool:
+def _off_px(old: PosedFrame, new: PosedFrame | None, before: Layout, after: Layout) -> float:
+    """How far the frame has moved; another gain counts as if it had."""
     if old is new:
-        return False
+        return 0.0
+    if new is None:
+        return math.inf
     assert after.zoom is not None
     move = moved_px(outline_px(old, before.world, after.zoom), outline_px(new, after.world, after.zoom))
-    return move > SHOWN_MOVE_PX or float(np.abs(np.subtract(old.gain, new.gain)).max()) > SHOWN_GAIN
+    gain = float(np.abs(np.subtract(old.gain, new.gain)).max())
+    return max(move, gain / SHOWN_GAIN * SHOWN_MOVE_PX)
 
 
 def everything(layout: Layout, published: Iterable[Key]) -> dict[Key, int]:

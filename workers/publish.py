@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from core.coverage import overview, top_zoom
+from core.coverage import overview, quarter, top_zoom
 from core.grid import TileKey, children, parent
 from services.catalog import backlog, missions, tiles
 from services.catalog.tiles import Key, Render, TileBox
 from services.errors import RevisionConflict
 from services.queue import send
 from workers.app import CLAIM_TTL_S, Stopwatch, db, log, settings, stage, store
-from workers.pictures import Quarters, put_tile
+from workers.pictures import Pictures, put_tile
 
-quarters = Quarters(store, settings.photo_cache_bytes // 8)
+quarters = Pictures(store, settings.tile_cache_bytes // 2, quarter)
 ENOUGH, ENOUGH_LIVE = 128, 24
 """Tiles that are worth a revision of their own while others are still drawn: every revision has its price,
 the overviews up to the top.

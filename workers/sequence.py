@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from core.coverage import pass_pixels
+from core.grid import TILE_PX
 from core.matching import PairMatch
 from core.mosaic import Layout, lay_out, solved
 from core.pose_graph import GraphFrame, Solution, place
@@ -23,13 +25,15 @@ from workers import surveyed, tying, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
 from workers.lease import held
 from workers.photos import Pixels, shelf
-from workers.posing import DEFERRED, Known, changed, everything, joined, update_of
+from workers.posing import Known, changed, everything, joined, update_of
 from workers.tying import sighting
 
 GROWTH = 2.0
 """All poses are solved again when the mission, or its frames with GPS, grew so many times since the last."""
 MERGE_GROWTH = 1.02
 """When maps that were apart are tied, so much is enough, or a moment in which there is nothing else to do."""
+LIVE_SHARE = 0.95
+"""What may be rendered before the final pass, as a share of that pass."""
 FEW = 8
 ASK_AGAIN_S = 10.0
 LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 12, 16, 24
@@ -101,8 +105,8 @@ def _step(mission_id: str, epoch: int) -> bool:
         return True
     if desk.to_render:
         return _dispatch(mission, desk)
-    if mission.state == "open" and desk == IDLE and _catch_up(mission, epoch):
-        return True
+    if desk == IDLE and _rests(mission):
+        return _solve_finally(mission, epoch)
     if desk.to_publish and not desk.in_flight:
         send("publish", mission_id)  # normally the fuse task has: it may have died in between
         return False
@@ -163,14 +167,11 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
         frames_here = [known.seen[k] for k in sorted(before.frames.keys() | new_ids)]
         found = place(solution, frames_here, new_ids, matches)
         after = joined(before, found, new_ids, known.camera_keys, mission.mode)
-        dirty = changed(before, after)
+        dirty = changed(before, after).dirty(0)
         update = update_of(after, known.camera_keys, new_ids)
-    later = {tile for tile, priority in dirty.items() if priority == DEFERRED}
-    now = {tile: priority for tile, priority in dirty.items() if tile not in later}
     with db.write() as tx:
-        generation = poses.save(tx, mission.id, epoch, replace(update, dirty=now))
+        generation = poses.save(tx, mission.id, epoch, replace(update, dirty=dirty))
         clock.spend(tx, mission.id, "pose")
-    known.deferred = (known.deferred | later) - now.keys()
     known.untried |= new_ids
     known.layout, known.generation = after, generation
     log.info("posed", mission=mission.id, new=len(new_ids), posed=len(after.frames), dirty=len(dirty))
@@ -205,9 +206,11 @@ def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, 
     found = surveyed.held(found, known.seen, surveyed.points_of(mission.id))
     zoom_now = before.zoom if before is not None else None
     thumb = _thumb(mission.id)
-    after = lay_out(found, known.camera_keys, thumb, mission.max_side, zoom_now, mission.mode)
-    rezoomed = before is not None and before.zoom is not None and before.zoom != after.zoom
-    dirty = everything(after, _published(mission.id)) if rezoomed else changed(before, after)
+    after = lay_out(found, known.camera_keys, thumb, mission.drawn_side, zoom_now, mission.mode)
+    if before is not None and before.zoom is not None and before.zoom != after.zoom:
+        dirty = everything(after, _published(mission.id))
+    else:
+        dirty = changed(before, after).dirty(_may_heal(mission, after))
     total, rms_px = len(after.frames) + len(after.waiting), found.reprojection_rms_px
     update = replace(
         update_of(after, known.camera_keys),
@@ -220,16 +223,22 @@ def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, 
     return after, dirty, update
 
 
-def _catch_up(mission: Mission, epoch: int) -> bool:
-    """Nothing else is to be done: render what was put off. If this process dies before, finalising will."""
-    known = _known.get(mission.id)
-    if known is None or known.generation != mission.generation or not known.deferred:
+def _may_heal(mission: Mission, layout: Layout) -> int:
+    """How many tiles may be drawn again now.
+
+    Until the mission is final, all rendering together stays below one pass over all tiles: poses will move
+    again, and the final pass redraws everything.
+    """
+    spent = mission.pixels.get("new", 0) + mission.pixels.get("heal", 0)
+    return max(0, int(LIVE_SHARE * pass_pixels(layout.cover) - spent) // TILE_PX**2)
+
+
+def _rests(mission: Mission) -> bool:
+    """Whether no photo has come for a while, and what is shown is not what finalising would show."""
+    if mission.state != "open" or mission.generation <= (mission.healed_generation or 0):
         return False
-    with db.write() as tx:
-        update = PoseUpdate(dirty=dict.fromkeys(known.deferred, DEFERRED))
-        known.generation = poses.save(tx, mission.id, epoch, update)
-    known.deferred = set()
-    return True
+    with db.read() as tx:
+        return frames.quiet_s(tx, mission.id) >= settings.stalled_after_s
 
 
 def _solve_all(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:
@@ -269,10 +278,11 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
     found, submaps = solved(list(graph.values()), pairs_of_all, KnownScale.from_json(mission.scale))
     found = surveyed.held(found, graph, points)
     keys = {k: f.meta.camera_key for k, f in graph.items()}
-    layout = lay_out(found, keys, _thumb(mission.id), mission.max_side, mode=mission.mode)
+    layout = lay_out(found, keys, _thumb(mission.id), mission.drawn_side, mode=mission.mode)
     update = replace(
         update_of(layout, keys),
         dirty=everything(layout, _published(mission.id)),
+        pass_pixels=pass_pixels(layout.cover),
         solved_frames=len(graph),
         reprojection_rms_px=found.reprojection_rms_px,
         submaps=submaps.to_json(),
@@ -285,7 +295,9 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
             return True  # other points, or another scale, came meanwhile
         generation = poses.save(tx, mission.id, epoch, update)
         clock.spend(tx, mission.id, "solve")
-    _known[mission.id] = Known(generation, layout, len(graph), found.reprojection_rms_px, graph)
+    known = Known(generation, layout, len(graph), found.reprojection_rms_px, graph)
+    known.solved_located = known.located(graph)
+    _known[mission.id] = known
     log.info("solved finally", mission=mission.id, frames=len(graph), posed=len(layout.frames))
     return True
 

@@ -49,11 +49,11 @@ def in_mosaic(
     """
     frames = by_name((n.name, n.posed) for n in named)
     seen = observations(points, world, frames)
-    gsd_m = mission_gsd_m((n.posed for n in named), mission.max_side)
+    gsd_m = mission_gsd_m((n.posed for n in named), mission.drawn_side)
     if gsd_m is None or not seen:
         return mosaic_document({}, None)
     grid = mosaic_grid(world, [n.posed for n in named], gsd_m, MOSAIC.max_pixels)
-    photos = MissionPhotos(shelf, mission.id, mission.max_side)
+    photos = MissionPhotos(shelf, mission.id, mission.drawn_side)
     index = FrameIndex(n.posed for n in named if ground_outline(n.posed) is not None)
 
     def picture(window: UtmGrid) -> NDArray[np.uint8]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from sqlalchemy import ColumnElement, func, or_, select, tuple_
 from sqlalchemy.orm import Session
 
-from services.catalog.rows import chunks, clock
-from services.catalog.tiles import Key
-from services.tables import DirtyTile, Frame
+from services.catalog.rows import chunks, clock, mission
+from services.catalog.tiles import HEAL, Key, Render, waiting
+from services.tables import DirtyTile, Frame, Tile
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,20 +44,47 @@ def of(tx: Session, mission_id: str, ttl_s: float, now: float | None = None) -> 
     return Backlog(unread, frames.get("matched", 0), in_flight, to_render, to_publish)
 
 
-def unrendered(tx: Session, mission_id: str, keys: Collection[Key]) -> Mapping[Key, int]:
-    """Those of these tiles that are to be rendered, sorted: each with the generation it then shows.
+@dataclass(frozen=True, slots=True)
+class ToDraw:
+    """A dirty tile: the `generation` that its new picture will show, and what it shows so far, if anything.
+
+    `whole`: all of it is to be drawn, not only what it does not show yet.
+    """
+
+    generation: int
+    whole: bool
+    shown: Render | None
+
+
+def unrendered(tx: Session, mission_id: str, keys: Collection[Key]) -> Mapping[Key, ToDraw]:
+    """Those of these tiles that are to be rendered, sorted.
 
     Read it in the same transaction as the poses: those are as new as that generation, or newer.
     """
-    found: dict[Key, int] = {}
+    final = mission(tx, mission_id).final_generation is not None
+    found: dict[Key, ToDraw] = {}
     for some in chunks(sorted((z, x, y) for z, x, y in keys)):
-        query = select(DirtyTile.z, DirtyTile.x, DirtyTile.y, DirtyTile.generation).where(
+        query = select(DirtyTile).where(
             DirtyTile.mission_id == mission_id,
             tuple_(DirtyTile.z, DirtyTile.x, DirtyTile.y).in_(some),
             _to_do(),
         )
-        found |= {(z, x, y): generation for z, x, y, generation in tx.execute(query)}
-    return dict(sorted(found.items()))
+        for row in tx.scalars(query.execution_options(populate_existing=True)):
+            shown = waiting(row) if row.rendered_generation is not None else None
+            key = (row.z, row.x, row.y)
+            found[key] = ToDraw(row.generation, final or row.priority >= HEAL, shown)
+    published = _published(tx, mission_id, [key for key, todo in found.items() if todo.shown is None])
+    return {key: replace(found[key], shown=found[key].shown or published.get(key)) for key in sorted(found)}
+
+
+def _published(tx: Session, mission_id: str, keys: Sequence[Key]) -> Mapping[Key, Render]:
+    found: dict[Key, Render] = {}
+    for some in chunks(keys):
+        query = select(Tile).where(Tile.mission_id == mission_id, tuple_(Tile.z, Tile.x, Tile.y).in_(some))
+        for t in tx.scalars(query.execution_options(populate_existing=True)):
+            picture = (t.object_key, t.etag, t.media_type, t.size_bytes, t.inputs)
+            found[t.z, t.x, t.y] = Render((t.z, t.x, t.y), t.generation, *picture)
+    return found
 
 
 def _to_do() -> ColumnElement[bool]:

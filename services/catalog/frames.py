@@ -5,6 +5,7 @@ One that ties to nothing that has a place is waiting: it is kept, and posed when
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -276,6 +277,12 @@ def latencies_s(tx: Session, mission_id: str) -> Sequence[float]:
         Frame.mission_id == mission_id, Frame.fused_at.is_not(None)
     )
     return [fused - received for fused, received in tx.execute(query) if fused is not None]
+
+
+def quiet_s(tx: Session, mission_id: str, now: float | None = None) -> float:
+    """Seconds since the last photo came; inf when none ever did."""
+    newest = tx.scalar(select(func.max(Frame.received_at)).where(Frame.mission_id == mission_id))
+    return math.inf if newest is None else clock(now) - newest
 
 
 def stalled(tx: Session, older_than_s: float, now: float | None = None) -> Sequence[Wake]:

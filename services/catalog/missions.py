@@ -69,6 +69,7 @@ def create(
         cameras={},
         stage_seconds={},
         scale=scale.to_json(),
+        pixels={},
     )
     tx.add(row)
     tx.flush()
@@ -175,6 +176,13 @@ def spend(tx: Session, mission_id: str, stage: str, seconds: float) -> None:
     row.stage_seconds = row.stage_seconds | {stage: row.stage_seconds.get(stage, 0.0) + seconds}
 
 
+def count_pixels(tx: Session, mission_id: str, pixels: Mapping[str, int]) -> None:
+    """Add to the pixels that were rendered: of new ground, to heal, by the final pass, to sharpen."""
+    row = lock(tx, mission_id)
+    more = {kind: row.pixels.get(kind, 0) + n for kind, n in pixels.items() if n}
+    row.pixels = row.pixels | more
+
+
 def progress(tx: Session, mission_id: str, now: float | None = None) -> Progress:
     """How far the mission has come; raises MissionNotFound."""
     row = mission(tx, mission_id)
@@ -209,7 +217,7 @@ def stalled(tx: Session, older_than_s: float, now: float | None = None) -> Seque
     query = (
         select(Mission, rendered)
         .where(Mission.state.in_(_UNDER_WAY), func.coalesce(Mission.woken_at, 0.0) < now - older_than_s)
-        .where((Mission.state == "finalising") | _has_tiles_to_show())
+        .where((Mission.state == "finalising") | _has_tiles_to_show() | _is_behind())
         .order_by(Mission.id)
         .with_for_update(of=Mission, skip_locked=True)
         .execution_options(populate_existing=True)
@@ -225,6 +233,11 @@ def stalled(tx: Session, older_than_s: float, now: float | None = None) -> Seque
 def _has_tiles_to_show() -> ColumnElement[bool]:
     dirty = exists().where(DirtyTile.mission_id == Mission.id)
     return dirty | exists().where(Frame.mission_id == Mission.id, Frame.state == "posed")
+
+
+def _is_behind() -> ColumnElement[bool]:
+    """Poses were found since all tiles were drawn last: once no more photos come, they are drawn again."""
+    return Mission.generation > func.coalesce(Mission.healed_generation, 0)
 
 
 def _has_unfinished() -> ColumnElement[bool]:

@@ -44,7 +44,7 @@ class PoseUpdate:
     `waiting`: frames that wait for a tie, with the pose on their island; None for one that is alone.
     `dirty`: native tile → priority (0 first), all that now look different. `cameras`: refined, by key.
     `solved_frames`: frames in the global solve, when this was one; `submaps`: what it was made of. `final`:
-    it was the canonical one.
+    it was the canonical one. `pass_pixels`: what drawing all tiles once takes.
     """
 
     placed: Sequence[Placed] = ()
@@ -57,6 +57,7 @@ class PoseUpdate:
     solved_frames: int | None = None
     reprojection_rms_px: float | None = None
     submaps: Mapping[str, Any] | None = None
+    pass_pixels: int | None = None
     final: bool = False
 
 
@@ -163,8 +164,10 @@ def _save_mission(row: Mission, change: PoseUpdate) -> None:
         row.reprojection_rms_px = float(change.reprojection_rms_px)
     if change.submaps is not None:
         row.submaps = dict(change.submaps)
+    if change.pass_pixels is not None:
+        row.pass_pixels = change.pass_pixels
     if change.final:
-        row.final_generation = row.generation
+        row.final_generation = row.healed_generation = row.generation
 
 
 def _camera_json(camera: Camera) -> dict[str, Any]:

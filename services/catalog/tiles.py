@@ -33,12 +33,17 @@ from services.tables import DirtyTile, Frame, FramePose, Tile, TileVersion
 
 Key = tuple[int, int, int]  # z, x, y: core.grid.TileKey is one
 
+NEW, GROWN, HEAL = 0, 1, 5
+"""Priorities of dirty tiles: where nothing was shown yet, where ground was added, where poses moved. Before
+the mission is solved finally, those before HEAL are only drawn where they show nothing."""
+
 
 @dataclass(frozen=True, slots=True)
 class Render:
     """One tile's new picture, drawn from the poses of `generation`. Without an object it is empty.
 
-    `etag`: a digest of the encoded picture, equal for equal bytes.
+    `etag`: a digest of the encoded picture, equal for equal bytes. `inputs`: of all that it was drawn from,
+    when it was drawn as a whole.
     """
 
     key: Key
@@ -47,6 +52,7 @@ class Render:
     etag: str | None = None
     media_type: str | None = None
     size_bytes: int = 0
+    inputs: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +178,7 @@ def pending_renders(tx: Session, mission_id: str, limit: int | None = None) -> S
         .limit(limit)
         .execution_options(populate_existing=True)
     )
-    return [_pending(row) for row in tx.scalars(query)]
+    return [waiting(row) for row in tx.scalars(query)]
 
 
 def publish(
@@ -202,6 +208,7 @@ def publish(
         _flip(tx, mission_id, row.revision, news)
         shown = [r.key for r in news]
         events.append(tx, mission_id, "tiles", {"revision": row.revision, "tiles": shown}, now)
+    _note_inputs(tx, mission_id, changes)
     _clean(tx, mission_id, rendered)
     fuse_frames(tx, mission_id, now)
     return row.revision
@@ -363,6 +370,14 @@ def _flip(tx: Session, mission_id: str, revision: int, news: Sequence[Render]) -
     tx.execute(upsert, tiles)
 
 
+def _note_inputs(tx: Session, mission_id: str, changes: Collection[Render]) -> None:
+    """Also a picture that is no news may have been drawn from other poses than the one shown."""
+    tile = table(Tile)
+    rows = [_tile_params(mission_id, r.key) | {"drawn_from": r.inputs} for r in changes]
+    if rows:
+        tx.execute(update(tile).where(_is_tile(tile)).values(inputs=bindparam("drawn_from")), rows)
+
+
 def _clean(tx: Session, mission_id: str, rendered: Collection[Render]) -> None:
     """Delete the dirty tiles that are out; of those dirtied again, remember from when on they are not."""
     dirty = table(DirtyTile)
@@ -379,12 +394,12 @@ def _clean(tx: Session, mission_id: str, rendered: Collection[Render]) -> None:
     tx.execute(kept.values(rendered_generation=None, rendered=None), rows)
 
 
-def _is_tile(dirty: Any) -> Any:
+def _is_tile(rows: Any) -> Any:
     return and_(
-        dirty.c.mission_id == bindparam("tile_mission"),
-        dirty.c.z == bindparam("tile_z"),
-        dirty.c.x == bindparam("tile_x"),
-        dirty.c.y == bindparam("tile_y"),
+        rows.c.mission_id == bindparam("tile_mission"),
+        rows.c.z == bindparam("tile_z"),
+        rows.c.x == bindparam("tile_x"),
+        rows.c.y == bindparam("tile_y"),
     )
 
 
@@ -395,16 +410,18 @@ def _tile_params(mission_id: str, key: Key) -> dict[str, Any]:
 
 def _rendered_json(render: Render) -> dict[str, Any]:
     if render.object_key is None:
-        return {"empty": True}
+        return {"empty": True, "inputs": render.inputs}
     return {
         "object_key": render.object_key,
         "etag": render.etag,
         "media_type": render.media_type,
         "size_bytes": render.size_bytes,
+        "inputs": render.inputs,
     }
 
 
-def _pending(row: DirtyTile) -> Render:
+def waiting(row: DirtyTile) -> Render:
+    """What was rendered for this tile last and is not published yet."""
     fields = {k: v for k, v in (row.rendered or {}).items() if k != "empty"}
     return Render((row.z, row.x, row.y), row.rendered_generation or 0, **fields)
 
