@@ -24,8 +24,8 @@ def report(tx: Session, mission_id: str) -> dict[str, Any]:
     """Counts by state, rejected frames with reasons, seconds and δ per stage, latency, reprojection error.
 
     Times are seconds, the error is the RMS in pixels. `scale`: as it was given, and whether the map has its
-    scale from there; `checkpoints`: only where points were sent, `mosaic_revision`: when they were last
-    looked for in the mosaic, which is done for each report.json. Raises MissionNotFound.
+    scale from there; `checkpoints`: only where points were sent, `checkpoints_revision`: when they were
+    last looked for in the mosaic, which is done for each report.json. Raises MissionNotFound.
     """
     mission = missions.get(tx, mission_id)
     known = missions.progress(tx, mission_id)
@@ -55,20 +55,20 @@ def report(tx: Session, mission_id: str) -> dict[str, Any]:
         "delta": _deltas(rows),
         "latency_s": latency(frames.latencies_s(tx, mission_id)),
         "reprojection_rms_px": mission.reprojection_rms_px,
-        **({} if checked is None else {"checkpoints": checked}),
+        **checked,
     }
 
 
-def _checkpoints(tx: Session, mission_id: str, rows: Sequence[Frame]) -> Mapping[str, Any] | None:
+def _checkpoints(tx: Session, mission_id: str, rows: Sequence[Frame]) -> Mapping[str, Any]:
     """How far the surveyed points lie off: through today's poses, in the mosaic as it was last measured."""
     survey, points = surveys.get(tx, mission_id), surveys.checkpoints(tx, mission_id)
     if survey is None or points is None:
-        return None
+        return {}
     known = poses.load(tx, mission_id)
     names = {row.id: row.name for row in rows if row.media_type is not None}
     placed = [(names[k], p.posed(known.cameras)) for k, p in known.placed.items() if k in names]
     found = checkpoints_document(points, known.world, by_name(placed), names.values(), survey.measured)
-    return found | {"mosaic_revision": (survey.measured or {}).get("revision")}
+    return {"checkpoints": found, "checkpoints_revision": (survey.measured or {}).get("revision")}
 
 
 def _scale(tx: Session, mission: Mission, rows: Sequence[Frame]) -> Mapping[str, Any] | None:

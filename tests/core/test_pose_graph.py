@@ -277,6 +277,11 @@ def test_a_submap_without_gps_has_no_place_in_a_mission_that_has() -> None:
     solution = flight.with_meta(lambda k, m: replace(m, gps=None) if k >= 24 else m).solve()
     assert set(solution.unplaced.values()) == {"not_placeable"}
     assert len(solution.poses) == 24
+    assert solution.islands.keys() == solution.unplaced.keys()
+    assert {(p.source, p.submap) for p in solution.islands.values()} == {("vision-only", 1)}
+    island = replace(solution, world=WORLD, poses=solution.islands)
+    alone = replace(flight, frames=flight.frames[24:], centers=flight.centers[24:], R=flight.R[24:])
+    assert shape_error_m(alone, island)[0] < 0.15
 
 
 def test_gps_that_is_wrong_by_300_m_now_and_then_does_not_bend_the_map() -> None:

@@ -121,6 +121,41 @@ class TestStates:
             assert frames.mark_posed(tx, mission_id, ["f"]) == []
         assert state(db, mission_id, "f") == "rejected"
 
+    def test_a_frame_that_waits_is_kept_with_its_pose_until_it_is_tied(
+        self, db: Database, mission_id: str
+    ) -> None:
+        for frame_id in ("f", "g"):
+            advance(db, mission_id, frame_id, "matched")
+        island = {"submap": 3, "center": [1.5, 2.0, 60.0]}
+        with db.write() as tx:
+            assert frames.mark_waiting(tx, mission_id, {"g": None, "f": island}) == ["f", "g"]
+            assert frames.mark_waiting(tx, mission_id, {"f": island}) == []
+            assert frames.islands(tx, mission_id) == {"f": island, "g": None}
+        with db.read() as tx:
+            assert [s.state for s in frames.sightings(tx, mission_id)] == ["waiting"] * 2
+            assert "kept" in (frames.get(tx, mission_id, "f").reason or "")
+            assert missions.progress(tx, mission_id).idle
+        with db.write() as tx:
+            assert frames.mark_posed(tx, mission_id, ["f"]) == ["f"]
+            assert frames.mark_unplaced(tx, mission_id, {"g": ("oblique", "It shows the sky.")}) == ["g"]
+            assert frames.islands(tx, mission_id) == {}
+        with db.read() as tx:
+            frame = frames.get(tx, mission_id, "f")
+        assert (frame.state, frame.reason_code, frame.island) == ("posed", None, None)
+
+    def test_only_what_failed_for_our_reasons_is_tried_again(self, db: Database, mission_id: str) -> None:
+        for frame_id, code in (("f", "internal"), ("g", "truncated_image")):
+            receive(db, mission_id, frame_id)
+            with db.write() as tx:
+                frames.begin(tx, mission_id, frame_id)
+                frames.mark_rejected(tx, mission_id, frame_id, code, "Why.")
+        with db.write() as tx:
+            assert [frames.retry(tx, mission_id, f) for f in ("f", "g", "f")] == [True, False, False]
+        with db.read() as tx:
+            frame = frames.get(tx, mission_id, "f")
+        assert (frame.state, frame.reason, frame.attempts) == ("received", None, 0)
+        assert state(db, mission_id, "g") == "rejected"
+
     def test_an_unplaced_frame_is_seen_and_may_be_posed_later(self, db: Database, mission_id: str) -> None:
         advance(db, mission_id, "f", "matched")
         with db.write() as tx:

@@ -88,3 +88,38 @@ def test_the_first_frame_that_sees_two_maps_makes_them_one(
     assert apart == (4, {0, 1})
     assert now()[0] > 4
     assert now()[1] == {0}
+
+
+def test_two_drones_maps_merge_while_they_fly_though_no_neighbour_was_found(
+    bench: Any, strips: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def same_drone(mission_id: str, seen: Any, frame_id: str) -> list[Pair]:
+        mine = seen[frame_id].meta.drone
+        return [(min(k, frame_id), max(k, frame_id)) for k in seen if seen[k].meta.drone == mine]
+
+    def maps() -> set[int]:
+        with bench.db.read() as tx:
+            return set(poses.maps(tx, bench.mission_id))
+
+    tying = bench.modules["sequence"].tying
+    monkeypatch.setattr(bench.modules["match"], "neighbours", same_drone)
+    look, asked = tying.look, list[Pair]()
+    monkeypatch.setattr(tying, "look", lambda *_: [])
+    bench.upload(strips)
+    bench.drain()
+    assert maps() == {0, 1}
+
+    def looks(mission_id: str, known: Any) -> list[Pair]:
+        found = look(mission_id, known)
+        asked.extend(found)
+        return found
+
+    monkeypatch.setattr(tying, "look", looks)
+    known = bench.modules["sequence"]._known[bench.mission_id]
+    known.untried |= set(known.seen)
+    bench.send("sequence", bench.mission_id)
+    bench.drain()
+    assert maps() == {0}
+    assert 0 < len(asked) <= 8
+    with bench.db.read() as tx:
+        assert [t["accepted"] for t in missions.get(tx, bench.mission_id).submaps["ties"]] == [True]

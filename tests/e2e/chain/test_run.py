@@ -19,6 +19,9 @@ import pytest
 import rasterio
 from PIL import Image
 
+from core.simulation import FlightParams
+from workers.simulate import simulate
+
 PROGRAM = [sys.executable, "-m", "services.cli"]
 FILES = {"mosaic.tif", "tiles.pmtiles", "poses.json", "report.json", "footprints.geojson", "route.csv"}
 
@@ -138,6 +141,29 @@ def test_a_second_serve_on_the_same_folder_is_refused(new_stack: Callable[..., A
     assert stack.url in second.stderr
     assert stack.stop() < 6
     assert stack.nobody_left()
+
+
+def test_without_gps_a_first_height_gives_a_local_map_that_says_so(tmp_path: Path) -> None:
+    params = FlightParams(
+        drones=1, lines=1, per_line=4, width_px=480, height_px=360, no_gps=1.0, xmp=False, seed=8
+    )
+    simulate(params, tmp_path, jobs=2, truth=False)
+    photos, out = tmp_path / "images", tmp_path / "out"
+    for wrong in ("nowhere.jpg:1,2,90,80:4", "D1_0001.jpg:4"):
+        refused = orthostream("run", photos, "--out", out, "--marker", wrong)
+        assert refused.returncode == 2
+        assert "marker" in refused.stderr
+    done = orthostream("run", photos, "--out", out, "--first-height", "90")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Not georeferenced" in done.stdout
+    assert "what you gave" in done.stdout
+    report = json.loads((out / "report.json").read_text())
+    assert (report["georeferenced"], report["counts"]["fused"]) == (False, 4)
+    assert report["scale"] == {"first_height_m": 90.0, "marker": None, "used": True}
+    heights = [float(r["height_above_ground"]) for r in csv.DictReader((out / "route.csv").open())]
+    assert heights[0] == pytest.approx(90.0, rel=0.03)
+    with rasterio.open(out / "mosaic.tif") as mosaic:
+        assert "Not georeferenced" in mosaic.tags()["TIFFTAG_IMAGEDESCRIPTION"]
 
 
 def test_gnss_mode_needs_no_matches(flight: Path, tmp_path: Path) -> None:

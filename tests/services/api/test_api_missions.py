@@ -15,7 +15,7 @@ from core.frame import FrameMeta, GpsFix
 from core.geometry import Camera, Pose, World
 from services.api.context import Services
 from services.api.sweep import Sweep
-from services.catalog import exports, frames, leases, missions, poses, tiles
+from services.catalog import exports, frames, leases, missions, poses, surveys, tiles
 from services.catalog.poses import Placed, PoseUpdate
 from services.catalog.tiles import Render, TileBox
 
@@ -124,6 +124,54 @@ def test_lists_come_in_pages_without_gap_or_repeat(
     rest = api.get(f"/api/v1/missions?limit=5&after={first['next']}").json()
     assert len({m["id"] for m in first["missions"] + rest["missions"]}) == 8
     assert rest["next"] is None
+
+
+def test_what_is_known_of_the_scale_is_kept_and_can_be_changed(
+    api: TestClient, services: Services, sent
+) -> None:
+    marker = {"photo": "a.jpg", "pixels": [[10.0, 20.0], [40.0, 60.0]], "length_m": 2.5}
+    asked = {"first_height_m": 60.0, "marker": None}
+    made = api.post("/api/v1/missions", json={"scale": {"first_height_m": 60}}).json()
+    url = f"/api/v1/missions/{made['id']}"
+    assert (made["scale"], made["georeferenced"]) == (asked, None)
+    changed = api.put(f"{url}/scale", json={"marker": marker})
+    assert changed.json()["scale"] == {"first_height_m": None, "marker": marker}
+    assert sent.tasks == []  # no photo was placed by it yet
+    place(services, made["id"], "a.jpg", source="vision-only")
+    report = api.get(f"{url}/report").json()
+    assert report["scale"] == {"first_height_m": None, "marker": marker, "used": True}
+    assert (report["georeferenced"], api.get(url).json()["georeferenced"]) == (False, False)
+    assert api.put(f"{url}/scale", json={}).json()["scale"] is None
+    assert sent.tasks == [("sequence", made["id"])]
+    for wrong in ({"first_height_m": 0}, {"first_height_m": 9, "marker": marker}, {"marker": {"photo": "a"}}):
+        assert api.put(f"{url}/scale", json=wrong).status_code == 422
+        assert api.post("/api/v1/missions", json={"scale": wrong}).status_code == 422
+    same = {"marker": marker | {"pixels": [[1, 1], [1, 1]]}}
+    assert api.put(f"{url}/scale", json=same).json()["code"] == "bad_scale"
+
+
+def test_the_live_report_says_how_far_surveyed_points_lie_off(
+    api: TestClient, services: Services, mission_url: str
+) -> None:
+    mission_id = mission_of(mission_url)
+    place(services, mission_id, "a.jpg", "b.jpg")
+    rows = ["8.31 47.05 440 399.5 299.5 a.jpg P1", "8.31 47.05 440 9 9 gone.jpg P2"]
+    api.put(f"{mission_url}/checkpoints", content="\n".join(["EPSG:4326", *rows]))
+    told = api.get(f"{mission_url}/report").json()
+    assert told["checkpoints"]["poses"]["raw_m"] == pytest.approx(0.0, abs=1e-3)  # right below the camera
+    assert [(p["point"], p["unseen"]) for p in told["checkpoints"]["points"]] == [
+        ("P1", None), ("P2", "no_photo"),
+    ]  # fmt: skip
+    assert (told["checkpoints"]["mosaic"], told["checkpoints_revision"]) == (None, None)
+    found = {"revision": 4, "generation": 1, "mosaic": {"points": 2, "found": 1, "raw_m": 0.5}, "points": {}}
+    with services.db.write() as tx:
+        content = surveys.get(tx, mission_id).content  # type: ignore[union-attr]
+        surveys.keep_measured(tx, mission_id, "other points", {"revision": 9})
+        surveys.keep_measured(tx, mission_id, content, found)
+    told = api.get(f"{mission_url}/report").json()
+    assert (told["checkpoints"]["mosaic"], told["checkpoints_revision"]) == (found["mosaic"], 4)
+    api.delete(f"{mission_url}/checkpoints")
+    assert "checkpoints" not in api.get(f"{mission_url}/report").json()
 
 
 def test_finalise_wakes_the_sequencer_once_asked(api: TestClient, mission_url: str, sent) -> None:

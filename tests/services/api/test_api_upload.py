@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from services.api.context import Services
 from services.api.multipart import FormReader, clean_name
 from services.api.problems import BadUpload
+from services.catalog import frames
 from services.errors import OutOfDisk
 
 Jpeg = Callable[..., bytes]
@@ -63,6 +64,22 @@ def test_the_same_photo_again_is_the_same_frame(api: TestClient, mission_url: st
     assert again.json()["frames"][0]["created"] is False
     assert len(api.get(f"{mission_url}/frames").json()["frames"]) == 1
     assert len(sent.tasks) == 1
+
+
+def test_a_photo_that_failed_for_our_reasons_has_another_try(
+    api: TestClient, services: Services, mission_url: str, jpeg: Jpeg, sent
+) -> None:
+    mission_id = mission_url.rsplit("/", 1)[1]
+    send(api, mission_url, ("a.jpg", jpeg()))
+    with services.db.write() as tx:
+        frames.mark_rejected(tx, mission_id, frame_id(jpeg()), "internal", "The reader broke down.")
+    services.store.delete(f"missions/{mission_id}/photos/{frame_id(jpeg())}")
+    again = send(api, mission_url, ("a.jpg", jpeg()))
+    assert again.status_code == 200
+    (told,) = again.json()["frames"]
+    assert (told["state"], told["created"], "code" in told) == ("received", False, False)
+    assert sent.tasks == [("ingest", mission_id, frame_id(jpeg()))] * 2
+    assert services.store.get(f"missions/{mission_id}/photos/{frame_id(jpeg())}") == jpeg()
 
 
 def test_many_photos_one_result_each_in_order(api: TestClient, mission_url: str, jpeg: Jpeg) -> None:
@@ -122,8 +139,6 @@ def test_when_all_are_refused_for_different_reasons_each_is_listed(
 def test_telemetry_goes_with_its_photo(
     api: TestClient, services: Services, mission_url: str, jpeg: Jpeg
 ) -> None:
-    from services.catalog import frames
-
     said = json.dumps({"b.jpg": {"lat": 47.1, "lon": 8.2, "yaw": 90}})
     photos = [("files", ("a.jpg", jpeg(1))), ("files", ("b.jpg", jpeg(2)))]
     assert api.post(f"{mission_url}/frames", data={"telemetry": said}, files=photos).status_code == 201
