@@ -6,7 +6,7 @@ import numpy as np
 
 from core.geometry import Array
 from core.pose_graph.adjustment import Adjusted
-from core.pose_graph.elimination import Border
+from core.pose_graph.factor import Border, Factor, factorise
 from core.pose_graph.marginals import covariances
 from core.pose_graph.priors import Priors, yaw_jacobian
 from core.pose_graph.residuals import IntArray, State
@@ -27,21 +27,29 @@ def position_sigmas(adjusted: Adjusted, priors: Priors, pairs: IntArray, origins
     show, where matches are worse than believed; what hills do to level planes is added as GPS shows it. An
     error that all fixes of a flight share (a receiver's bias, a datum of its heights) is not in it.
     """
-    normal, state = adjusted.normal, adjusted.state
+    state, factor = adjusted.state, adjusted.factor
+    if factor is None or len(origins):
+        factor = _held_factor(adjusted, origins)
+    if factor is None:
+        return np.full((len(state.R), 3), np.nan)
+    blocks = covariances(factor, len(state.R))
+    unit = max(1.0, float(np.median(adjusted.squared)) / MEDIAN_2D**2) if adjusted.squared.size else 1.0
+    variance = np.diagonal(blocks, axis1=1, axis2=2)[:, 3:6] * unit + shared_misfit(priors, state, pairs)
+    return np.asarray(np.sqrt(np.where(variance > 0, variance, np.nan)))
+
+
+def _held_factor(adjusted: Adjusted, origins: IntArray) -> Factor | None:
+    """The factor of the normal equations with the origins held in place."""
+    normal, R = adjusted.normal, adjusted.state.R
     frame = normal.frame.copy()
     for k in origins.tolist():
-        turn = yaw_jacobian(state.R[k : k + 1])[0]
+        turn = yaw_jacobian(R[k : k + 1])[0]
         frame[k, 3, 3] += 1 / FIXED_M**2
         frame[k, 4, 4] += 1 / FIXED_M**2
         frame[k, 6, 6] += 1 / FIXED_M**2
         frame[k, :3, :3] += np.outer(turn, turn) / FIXED_RAD**2
     border = Border(normal.cross, normal.border, normal.border_rhs)
-    blocks = covariances(adjusted.structure, frame, normal.pair, border)
-    if blocks is None:
-        return np.full((len(frame), 3), np.nan)
-    unit = max(1.0, float(np.median(adjusted.squared)) / MEDIAN_2D**2) if adjusted.squared.size else 1.0
-    variance = np.diagonal(blocks, axis1=1, axis2=2)[:, 3:6] * unit + shared_misfit(priors, state, pairs)
-    return np.asarray(np.sqrt(np.where(variance > 0, variance, np.nan)))
+    return factorise(adjusted.structure, frame, normal.pair, normal.frame_rhs, border)
 
 
 def shared_misfit(priors: Priors, state: State, pairs: IntArray) -> Array:

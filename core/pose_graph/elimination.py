@@ -1,12 +1,13 @@
-"""Sparse normal equations as a gtsam factor graph: a key per frame, and a last one that all frames share.
+"""In which order, and in which dense fronts, the unknowns of a pose graph are eliminated.
 
-gtsam eliminates the linearised graph front by front (a Bayes tree of dense conditionals), in an order with
-little fill-in (nested dissection by METIS) that serves every linearisation of the same pairs.
+gtsam finds an order with little fill-in (nested dissection by METIS); frames with nearly the same neighbours
+are eliminated together, so that almost all arithmetic happens in dense matrices (multifrontal elimination,
+Duff and Reid 1983, as in gtsam's Bayes tree). One plan serves every linearisation of the same pairs. The
+numbers are in `core.pose_graph.factor`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -14,98 +15,56 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from core.geometry import Array
 from core.pose_graph.residuals import IntArray
 
-# Below this any order costs less than finding a good one.
+# Below this a graph is one dense matrix: any order costs less than finding a good one.
 SMALL = 30
+# Frames join a front when that stores at most this many blocks of zeros, or this share of the front.
+SLACK_BLOCKS = 24
+SLACK_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Border:
-    """Unknowns that touch every frame: `cross` (N, d, B), `matrix` (B, B), `rhs` (B,)."""
+class Front:
+    """A dense step of the elimination: the first `pivots` of `nodes` go, the rest is handed to `parent`.
 
-    cross: Array
-    matrix: Array
-    rhs: Array
-
-
-@dataclass(frozen=True, slots=True)
-class Structure:
-    """The `pairs` of frames that are tied, and the `order` (N,) in which frames are eliminated."""
-
-    pairs: tuple[tuple[int, int], ...]
-    order: IntArray
-
-    def __len__(self) -> int:
-        """The number of frames."""
-        return len(self.order)
-
-
-@dataclass(frozen=True, slots=True)
-class Eliminated:
-    """gtsam's `tree` of conditionals, and the `order` of its keys: k for frame k, N for the border."""
-
-    tree: gtsam.GaussianBayesTree
-    order: IntArray
-
-
-def plan(n: int, pairs: IntArray) -> Structure:
-    """How to eliminate `n` frames tied by `pairs` (E, 2)."""
-    return Structure(tuple((i, j) for i, j in pairs.tolist()), _order(n, pairs))
-
-
-def gaussian_graph(
-    pairs: Sequence[tuple[int, int]], frame: Array, pair: Array, rhs: Array, border: Border | None
-) -> gtsam.GaussianFactorGraph:
-    """H·x = `rhs` (N, d) in HessianFactors: `frame` (N, d, d), `pair` (E, d, d: row the pair's first frame).
-
-    A pair's factor carries only its block off the diagonal: its share of the diagonal is in `frame` already,
-    and elimination sums all factors of a key before it factorises.
+    `nodes`: frames in order of elimination. `parent`: index of a later front, −1 for a last one. `at`: where
+    the nodes that stay lie in the parent's `nodes`. `pairs`: rows (edge, row, column, flipped) of the blocks
+    below the diagonal that enter here; `flipped`: 1 when the pair's block is to be transposed.
     """
-    n, d = rhs.shape
-    graph = gtsam.GaussianFactorGraph()
-    add, factor = graph.push_back, gtsam.HessianFactor
-    if border is None:
-        for k in range(n):
-            add(factor(k, frame[k], rhs[k], 0.0))
-    else:
-        add(factor(n, border.matrix, border.rhs, 0.0))
-        no_border, no_border_rhs = np.zeros_like(border.matrix), np.zeros_like(border.rhs)
-        for k in range(n):
-            add(factor(k, n, frame[k], border.cross[k], rhs[k], no_border, no_border_rhs, 0.0))
-    no_frame, no_rhs = np.zeros((d, d)), np.zeros(d)
-    for (i, j), block in zip(pairs, pair, strict=True):
-        add(factor(i, j, no_frame, block, no_rhs, no_frame, no_rhs, 0.0))
-    return graph
+
+    nodes: IntArray
+    pivots: int
+    parent: int
+    at: IntArray
+    pairs: IntArray
 
 
-def eliminate(
-    structure: Structure, frame: Array, pair: Array, rhs: Array, border: Border | None = None
-) -> Eliminated | None:
-    """The Bayes tree of `gaussian_graph`, the border last; None where H is not positive definite."""
-    order = structure.order if border is None else np.append(structure.order, len(structure))
-    ordering = gtsam.Ordering()
-    for k in order.tolist():
-        ordering.push_back(k)
-    graph = gaussian_graph(structure.pairs, frame, pair, rhs, border)
-    try:
-        return Eliminated(graph.eliminateMultifrontal(ordering), order)
-    except RuntimeError:
-        return None
-
-
-def solve_blocks(
-    structure: Structure, frame: Array, pair: Array, rhs: Array, border: Border | None = None
-) -> tuple[Array, Array] | None:
-    """Solution (N, d) and (B,) of H·x = `rhs` (N, d); None where H is not positive definite."""
-    done = eliminate(structure, frame, pair, rhs, border)
-    if done is None:
-        return None
-    step = done.tree.optimize()
-    x = np.array([step.at(k) for k in range(len(structure))]).reshape(rhs.shape)
-    y = np.zeros(0) if border is None else np.asarray(step.at(len(structure)), float)
-    return (x, y) if np.isfinite(x).all() and np.isfinite(y).all() else None
+def plan(n: int, pairs: IntArray) -> tuple[Front, ...]:
+    """Fronts, children before parents, for `n` frames tied by `pairs` (E, 2)."""
+    order = _order(n, pairs)
+    rank = np.empty(n, np.int64)
+    rank[order] = np.arange(n)
+    ranked = rank[pairs].reshape(-1, 2)
+    eliminated, stays = _grouped(_structure(n, ranked))
+    home = np.zeros(n, np.int64)
+    for k, group in enumerate(eliminated):
+        home[group] = k
+    # a block enters where the earlier of its two frames goes
+    flipped = ranked[:, 0] < ranked[:, 1]
+    entry = np.column_stack((np.arange(len(pairs)), ranked.max(1), ranked.min(1), flipped)).astype(np.int64)
+    at_front = home[entry[:, 2]]
+    by_front = np.argsort(at_front, kind="stable")
+    cuts = np.searchsorted(at_front[by_front], np.arange(len(eliminated) + 1))
+    own = [np.array(g + s, np.int64) for g, s in zip(eliminated, stays, strict=True)]
+    fronts = []
+    for k, (group, rest) in enumerate(zip(eliminated, stays, strict=True)):
+        mine = entry[by_front[cuts[k] : cuts[k + 1]]]
+        mine[:, 1:3] = np.searchsorted(own[k], mine[:, 1:3])
+        parent = int(home[rest[0]]) if rest else -1
+        at = np.searchsorted(own[parent], rest).astype(np.int64)
+        fronts.append(Front(order[own[k]], len(group), parent, at, np.ascontiguousarray(mine)))
+    return tuple(fronts)
 
 
 def _order(n: int, pairs: IntArray) -> IntArray:
@@ -134,3 +93,38 @@ def _dissected(n: int, pairs: IntArray) -> IntArray:
         graph.push_factor(i, j)
     found = gtsam.Ordering.MetisSymbolicFactorGraph(graph)
     return np.array([found.at(k) for k in range(n)], np.int64)
+
+
+def _structure(n: int, ranked: IntArray) -> list[set[int]]:
+    """Per position of the order, the later positions that its elimination ties together."""
+    if n <= SMALL:
+        return [set(range(k + 1, n)) for k in range(n)]
+    later: list[set[int]] = [set() for _ in range(n)]
+    for i, j in zip(ranked.min(1).tolist(), ranked.max(1).tolist(), strict=True):
+        later[i].add(j)
+    for mine in later:
+        if mine:
+            parent = min(mine)
+            later[parent] |= mine
+            later[parent].discard(parent)
+    return later
+
+
+def _grouped(later: list[set[int]]) -> tuple[list[list[int]], list[list[int]]]:
+    """Positions eliminated together, and those that stay: fronts in order, both lists ascending."""
+    n = len(later)
+    groups: list[list[int]] = [[k] for k in range(n)]
+    children: list[list[int]] = [[] for _ in range(n)]
+    wasted = [0] * n
+    for k, mine in enumerate(later):
+        # largest children first: those are nearest to what stays here
+        for child in sorted(children[k], key=lambda c: (-len(later[c]), c)):
+            joined, size = groups[child] + groups[k], 1 + len(mine)
+            zeros = len(groups[child]) * (size + len(groups[k]) - 1 - len(later[child]))
+            zeros += wasted[child] + wasted[k]
+            if zeros <= max(SLACK_BLOCKS, SLACK_SHARE * len(joined) * (len(joined) + size)):
+                groups[k], groups[child], wasted[k] = joined, [], zeros
+        if mine:
+            children[min(mine)].append(k)
+    tops = [k for k in range(n) if groups[k]]
+    return [sorted(groups[k]) for k in tops], [sorted(later[k]) for k in tops]

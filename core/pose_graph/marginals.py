@@ -1,92 +1,86 @@
-"""Blocks of the inverse of sparse normal equations, from the conditionals that gtsam leaves.
+"""Blocks of the inverse of sparse normal equations, from their factor.
 
-The inverse's diagonal follows from them without the rest of the inverse (Takahashi, Fagan and Chin 1973),
-from the root of the Bayes tree to its leaves.
+The inverse's diagonal follows from the factor without the rest of the inverse (Takahashi, Fagan and Chin
+1973), from the last front back to the first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numba
 import numpy as np
-from scipy.linalg.blas import dtrsm
+from scipy.linalg.blas import dsymm, dtrsm
 from scipy.linalg.lapack import dpotri
 
 from core.geometry import Array
-from core.pose_graph.elimination import Border, Eliminated, Structure, eliminate
+from core.pose_graph.elimination import Front
+from core.pose_graph.factor import Factor
 from core.pose_graph.residuals import IntArray
 
 
-@dataclass(slots=True)
-class _Clique:
-    """The inverse's dense `block` of a clique, where each key begins in it, and children that still ask."""
-
-    block: Array
-    begin: dict[int, int]
-    asked: int
-
-
-def covariances(structure: Structure, frame: Array, pair: Array, border: Border) -> Array | None:
-    """The (N, d, d) diagonal blocks of the inverse of the whole matrix, border included; None where it is not
-    positive definite.
-    """
-    done = eliminate(structure, frame, pair, np.zeros(frame.shape[:2]), border)
-    if done is None:
-        return None
-    sizes = np.append(np.full(len(structure), frame.shape[1]), len(border.matrix))
-    return _diagonal_of_inverse(done, sizes)
+def _pick(out: Array, above: Array, at: IntArray, d: int) -> None:
+    """Fill `out` (lower triangle) with what `above` has of the nodes `at` and of the border."""
+    size = len(out)
+    where = np.empty(size, np.int64)
+    for q in range(size):
+        where[q] = at[q // d] * d + q % d if q // d < len(at) else len(above) - size + q
+    for q in range(size):
+        for p in range(q, size):
+            out[p, q] = above[where[p], where[q]]
 
 
-def _diagonal_of_inverse(done: Eliminated, sizes: IntArray) -> Array:
-    """The blocks of all frames, whose `sizes` (N + 1,) are equal; the last is the border's."""
-    n, d = len(sizes) - 1, int(sizes[0])
-    out, cliques, known = np.zeros((n, d, d)), dict[int, _Clique](), np.zeros(n + 1, bool)
-    # what a key is conditioned on goes after it: from the last key back, parents come before children
-    for key in done.order[::-1].tolist():
-        if known[key]:
-            continue
-        clique = done.tree[key]
-        conditional = clique.conditional()
-        keys, pivots = conditional.keys(), conditional.R().shape[0]
-        begin = dict(zip(keys, (np.cumsum(sizes[keys]) - sizes[keys]).tolist(), strict=True))
-        block = _block(conditional, _above(clique, cliques, [k for k in keys if begin[k] >= pivots], sizes))
-        if clique.nrChildren():
-            cliques[keys[0]] = _Clique(block, begin, clique.nrChildren())
-        for k in keys:
-            at = begin[k]
-            if at < pivots:
-                known[k] = True
-                if k < n:
-                    out[k] = block[at : at + d, at : at + d]
+_compile: Callable[[Any], Any] = numba.njit(cache=True, nogil=True)
+_pick = _compile(_pick)
+
+
+def covariances(factor: Factor, n: int) -> Array:
+    """The (N, d, d) diagonal blocks of the inverse of the whole matrix, border included."""
+    d, size = factor.d, factor.last.shape[1]
+    out = np.zeros((n, d, d))
+    unasked = _children(factor.fronts)
+    inverse: list[Array | None] = [None] * len(factor.fronts)
+    border = np.asfortranarray(factor.last[:size])
+    if size:
+        border = dpotri(border, lower=1)[0]
+    for k in range(len(factor.fronts) - 1, -1, -1):
+        front, L, W = factor.fronts[k], factor.lower[k], factor.below[k][:-1]
+        rest = border
+        if front.parent >= 0:
+            above = inverse[front.parent]
+            assert above is not None
+            rest = np.empty((len(W), len(W)), order="F")
+            _pick(rest, above, front.at, d)
+            unasked[front.parent] -= 1
+            if not unasked[front.parent]:
+                inverse[front.parent] = None
+        whole = _block(L, W, rest)
+        if unasked[k]:
+            inverse[k] = whole
+        for a, node in enumerate(front.nodes[: front.pivots].tolist()):
+            half = np.tril(whole[a * d : (a + 1) * d, a * d : (a + 1) * d])
+            out[node] = half + np.tril(half, -1).T
     return out
 
 
-def _above(clique: Any, cliques: dict[int, _Clique], stay: Sequence[int], sizes: IntArray) -> Array:
-    """The inverse's block of the keys that `stay`, as the clique's parent has it."""
-    if not stay:
-        return np.zeros((0, 0))
-    first = clique.parent().conditional().firstFrontalKey()
-    parent = cliques[first]
-    index = np.concatenate([np.arange(parent.begin[k], parent.begin[k] + sizes[k]) for k in stay])
-    parent.asked -= 1
-    if not parent.asked:
-        del cliques[first]
-    return np.asarray(parent.block[np.ix_(index, index)])
-
-
-def _block(conditional: Any, rest: Array) -> Array:
-    """The inverse's block of a clique from its conditional R·x + S·y = 0 and the block (s, s) of y."""
-    R = np.asfortranarray(conditional.R())
-    p, s = len(R), len(rest)
-    own = dpotri(R)[0]
-    own = np.triu(own) + np.triu(own, 1).T
-    block = np.empty((p + s, p + s))
+def _block(L: Array, W: Array, rest: Array) -> Array:
+    """The inverse's block of a front (lower triangle) from its factor and the block of the rows below."""
+    p, s = len(L), len(W)
+    whole = np.empty((p + s, p + s), order="F")
+    whole[:p, :p] = dpotri(L, lower=1)[0]
     if s:
-        G = dtrsm(1.0, R, conditional.S())
-        mixed = -G @ rest
-        own = own - mixed @ G.T
-        block[:p, p:], block[p:, :p], block[p:, p:] = mixed, mixed.T, rest
-    block[:p, :p] = own
-    return block
+        G = dtrsm(1.0, L, W, side=1, lower=1)
+        mixed = dsymm(-1.0, rest, G, lower=1)
+        whole[:p, :p] -= G.T @ mixed
+        whole[p:, :p], whole[p:, p:] = mixed, rest
+    return whole
+
+
+def _children(fronts: Sequence[Front]) -> list[int]:
+    """How many fronts hand on to each."""
+    count = [0] * len(fronts)
+    for front in fronts:
+        if front.parent >= 0:
+            count[front.parent] += 1
+    return count

@@ -30,7 +30,8 @@ class PoseParams:
     this many standard deviations (and this many times the median edge) is taken for a wrong match.
     `…_start_…`: before a mission shows how good its GPS and gimbal are; `…_floor_…`: the best that is
     believed of them afterwards. `min_downward`: cosine of the steepest tilt by the gimbal that still makes a
-    map photo; `oblique_ratio`: the furthest corner, in heights. Without GPS the scale comes from the first
+    map photo; `oblique_ratio`: the furthest corner, in heights. `focal_log_sigma`: where a camera has at most
+    `focal_frames` photos; with more it is held in proportion. Without GPS the scale comes from the first
     frame (Avola 2019, 2.1): `first_height_m` above ground, or `ground_px_per_m`, pixels per metre of ground
     as a marker of known size shows them, in the photo of the name `scale_image` if that is given.
     """
@@ -57,6 +58,7 @@ class PoseParams:
     yaw_sigma_rad: float = 0.5
     height_log_sigma: float = 0.4
     focal_log_sigma: float = 0.005
+    focal_frames: int = 100
     k1_sigma: float = 0.1
     k2_sigma: float = 0.03
     lag_sigma_s: float = 0.3

@@ -341,10 +341,8 @@ def retract(state: State, frames: Array, border: Array) -> State:
     c = CAMERA_DOF * len(state.lens)
     lens_step = border[:c].reshape(-1, CAMERA_DOF)
     lens = np.column_stack((state.lens[:, 0] * np.exp(lens_step[:, 0]), state.lens[:, 1:] + lens_step[:, 1:]))
-    return State(
-        state.R @ rotations(frames[:, :3]),
-        state.t + frames[:, 3:6],
-        state.h + frames[:, 6],
-        lens,
-        state.lag_s + border[c:],
-    )
+    t, height = state.t + frames[:, 3:6], state.t[:, 2] - state.h
+    # Heights above ground scale like the focal length, which flat ground cannot tell from them: long steps
+    # along that valley stay in it.
+    height = height * np.exp(np.clip((frames[:, 5] - frames[:, 6]) / height, -2.0, 2.0))
+    return State(state.R @ rotations(frames[:, :3]), t, t[:, 2] - height, lens, state.lag_s + border[c:])

@@ -76,14 +76,16 @@ def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
     sigma = params.sigma_of_f * start.state.lens[:, 0]
     held = replace(priors, lens_sigma=np.full_like(priors.lens_sigma, 1e-6), lag_sigma_s=1e-6)
     thin = edges.thinned(params.coarse_points)
-    coarse = adjust(thin, held, start.state, sigma, 5 * params.robust_scale, params.coarse_steps, 5e-3)
+    coarse = adjust(thin, held, start.state, sigma, 5 * params.robust_scale, params.coarse_steps, 2e-2)
     good = _right_edges(thin, coarse.squared, params.wrong_edge)
     edges = edges.subset(good)
     # relief makes most of the residuals: what this ground does decides how far a match is believed
     observed = float(np.sqrt(np.median(coarse.squared))) / MEDIAN_2D
     sigma = sigma * np.clip(observed, *params.sigma_range)
     priors = _learnt(tied, edges.pairs, priors, coarse.state, params)
-    fine = adjust(edges, priors, coarse.state, sigma, params.robust_scale, params.fine_steps, 3e-4)
+    same = coarse.structure if good.all() else None
+    scale = params.robust_scale
+    fine = adjust(edges, priors, coarse.state, sigma, scale, params.fine_steps, 1.5e-4, structure=same)
     left = {tuple(p) for p in edges.pairs.tolist()}
     ids = [f.frame_id for f in tied.frames]
     dropped = tuple((ids[i], ids[j]) for i, j in every.pairs.tolist() if (i, j) not in left)
@@ -126,6 +128,8 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
     gps[loose & s.has_gps, :2] = start.state.t[loose & s.has_gps, :2]
     c = len(s.cameras)
     focal = np.where(s.focal_known, params.focal_log_sigma, 3 * params.focal_log_sigma)
+    # noise in both photos of a pair pulls a focal length that flat ground hides, the more the more frames
+    focal = focal / np.sqrt(np.maximum(1.0, np.bincount(s.camera, minlength=c) / params.focal_frames))
     k1 = np.full(c, params.k1_sigma)
     k2 = np.full(c, params.k2_sigma)
     free = params.self_calibrate & (np.bincount(s.camera, minlength=c) >= params.min_frames_to_calibrate)

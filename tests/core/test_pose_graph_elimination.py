@@ -1,4 +1,4 @@
-"""The solution and the marginals of gtsam's elimination against dense algebra on graphs of every kind."""
+"""The solution and the marginals of the sparse elimination against dense algebra on graphs of every kind."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from core.pose_graph.chaining import chained
-from core.pose_graph.elimination import Border, eliminate, plan, solve_blocks
+from core.pose_graph.elimination import plan
+from core.pose_graph.factor import Border, factorise, solve_blocks
 from core.pose_graph.marginals import covariances
 
 D, SHARED = 3, 2
@@ -73,8 +74,9 @@ def test_solution_and_inverse_are_those_of_the_dense_matrix(name: str) -> None:
     expected = np.linalg.solve(dense, np.concatenate((rhs.ravel(), border.rhs)))
     assert solved is not None
     np.testing.assert_allclose(np.concatenate((solved[0].ravel(), solved[1])), expected, atol=1e-9)
-    blocks, inverse = covariances(structure, frame, pair, border), np.linalg.inv(dense)
-    assert blocks is not None
+    factor = factorise(structure, frame, pair, rhs, border)
+    assert factor is not None
+    blocks, inverse = covariances(factor, n), np.linalg.inv(dense)
     for k in range(n):
         at = slice(k * D, k * D + D)
         np.testing.assert_allclose(blocks[k], inverse[at, at], atol=1e-9)
@@ -85,26 +87,41 @@ def test_what_is_not_positive_definite_has_no_solution() -> None:
     frame, pair, rhs, border, _ = system(n, pairs)
     frame[17] -= 1e3 * np.eye(D)
     assert solve_blocks(plan(n, pairs), frame, pair, rhs, border) is None
-    assert covariances(plan(n, pairs), frame, pair, border) is None
+    assert factorise(plan(n, pairs), frame, pair, rhs, border) is None
 
 
-def test_every_frame_is_eliminated_once() -> None:
-    for n, pairs in GRAPHS.values():
-        assert sorted(plan(n, pairs.astype(np.int64)).order.tolist()) == list(range(n))
+@pytest.mark.parametrize("name", GRAPHS)
+def test_without_a_border_only_frames_are_solved(name: str) -> None:
+    n, pairs = GRAPHS[name][0], GRAPHS[name][1].astype(np.int64).copy()
+    frame, pair, rhs, _, dense = system(n, pairs)
+    solved = solve_blocks(plan(n, pairs), frame, pair, rhs)
+    assert solved is not None
+    np.testing.assert_allclose(
+        solved[0].ravel(), np.linalg.solve(dense[: n * D, : n * D], rhs.ravel()), atol=1e-9
+    )
+    assert solved[1].shape == (0,)
 
 
-def test_a_grid_stays_sparse() -> None:
-    n, pairs = 30**2, grid(30).astype(np.int64)
-    frame, pair, rhs, border, _ = system(n, pairs)
-    done = eliminate(plan(n, pairs), frame, pair, rhs, border)
-    assert done is not None
-    entries, seen = 0, set()
-    for k in range(n):
-        conditional = done.tree[k].conditional()
-        if conditional.firstFrontalKey() not in seen:
-            seen.add(conditional.firstFrontalKey())
-            entries += conditional.R().size + conditional.S().size
-    assert entries < 80 * n * D**2  # dense: n² / 2 = 450 n
+@pytest.mark.parametrize("name", GRAPHS)
+def test_every_frame_is_eliminated_once_and_before_those_it_is_handed_to(name: str) -> None:
+    n, pairs = GRAPHS[name][0], GRAPHS[name][1].astype(np.int64)
+    fronts = plan(n, pairs)
+    assert sorted(k for f in fronts for k in f.nodes[: f.pivots].tolist()) == list(range(n))
+    assert sorted(e for f in fronts for e in f.pairs[:, 0].tolist()) == list(range(len(pairs)))
+    for k, front in enumerate(fronts):
+        rest = front.nodes[front.pivots :].tolist()
+        assert not rest or front.parent > k
+        assert not rest or fronts[front.parent].nodes[front.at].tolist() == rest
+
+
+def test_a_grid_stays_sparse_and_grows_no_worse_than_n_log_n() -> None:
+    def entries(side: int) -> int:
+        fronts = plan(side**2, grid(side).astype(np.int64))
+        return sum(f.pivots * len(f.nodes) for f in fronts)
+
+    n = 30**2
+    assert entries(30) < 80 * n  # dense: n² / 2 = 450 n
+    assert entries(60) < 6 * entries(30)  # n·log n: 4.8, n^1.5: 8
 
 
 def test_the_same_numbers_give_the_same_bits() -> None:
