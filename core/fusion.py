@@ -112,22 +112,36 @@ def overlapping(
 
 
 def render(
-    grid: Grid, world: World, frames: Sequence[PosedFrame], photos: Photos, params: FusionParams = DEFAULT
+    grid: Grid,
+    world: World,
+    frames: Sequence[PosedFrame],
+    photos: Photos,
+    params: FusionParams = DEFAULT,
+    only: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.uint8]:
     """The mosaic on a grid: RGBA (height, width, 4) uint8, alpha 0 where no frame sees the ground.
 
     `frames`: at least those of `overlapping`; their order does not matter. Pure: equal input, equal bytes.
+    `only`: (height / cell, width / cell) of a grid of whole cells: what is drawn; elsewhere anything may be.
     """
     out = np.zeros((grid.height, grid.width, 4), np.uint8)
     frames = sorted(frames, key=lambda f: f.frame_id)
     lattice = Lattice.covering(grid, world, params.cell_px, PAD_CELLS)
-    scene = _Scene.of(lattice, grid.resolution_m(world), frames, photos, params)
+    scene = _Scene.of(lattice, grid.resolution_m(world), frames, photos, params, _kept(only))
     if scene is None:
         return out
     drawn = _draw(scene, lattice, grid.resolution_m(world), photos, params)
     top, left = grid.row0 - lattice.row0, grid.col0 - lattice.col0
     out[:] = drawn[top : top + grid.height, left : left + grid.width]
     return out
+
+
+def _kept(only: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """The lattice's cells without which the pixels of those in `only` would be others."""
+    if only is None:
+        return None
+    wide = cv2.dilate(np.pad(only, PAD_CELLS).astype(np.uint8), np.ones((2 * PAD_CELLS + 1,) * 2, np.uint8))
+    return np.asarray(wide, bool)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +161,7 @@ class _Scene:
         frames: Sequence[PosedFrame],
         photos: Photos,
         params: FusionParams,
+        kept: NDArray[np.bool_] | None = None,
     ) -> _Scene | None:
         """The winners among frames by ascending id (ties go to the lower); None when nobody sees it."""
         views = [_view(lattice, resolution_m, frame, photos, params) for frame in frames]
@@ -154,7 +169,10 @@ class _Scene:
         if not seen:
             return None
         weights = np.stack([views[k].weight for k in seen])
-        labels = np.where(weights.any(0), weights.argmax(0), NOBODY).astype(np.int16)
+        drawn = weights.any(0) if kept is None else weights.any(0) & kept
+        if not drawn.any():
+            return None
+        labels = np.where(drawn, weights.argmax(0), NOBODY).astype(np.int16)
         tones = Tones(
             np.stack([views[k].own for k in seen]),
             np.stack([views[k].even for k in seen]),

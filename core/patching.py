@@ -8,7 +8,7 @@ map is never made of parts.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -22,11 +22,8 @@ from core.grid import TILE_PX, MercatorGrid, TileKey
 from core.pyramid import Rgba, encode
 
 CELL_PX = 16
-FADE_PX = 24
-"""A part overlaps what is shown by so much, and fades into it."""
-WORTH_A_CUT_PX = 24_000
-"""Two parts instead of one must save so many pixels: each has its own price."""
-MOST_CUTS, STEP_CELLS = 2, 4
+FADE_PX = 16
+"""What is drawn overlaps what is shown by so much, and fades into it."""
 
 Mask = NDArray[np.bool_]
 
@@ -37,21 +34,6 @@ class Patched:
 
     changed: Mapping[TileKey, Encoded | None]
     pixels: int
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """Pixels from (left, top) to (right, bottom), the latter not included."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    @property
-    def pixels(self) -> int:
-        """How many it holds."""
-        return (self.right - self.left) * (self.bottom - self.top)
 
 
 def fill_block(
@@ -65,13 +47,41 @@ def fill_block(
     grid = block_grid(list(shown))
     canvas = _canvas(grid, shown)
     near = frames.overlapping(grid, world)
-    drawn = parts(holes(grid, world, near, canvas[..., 3], _wanted(grid, shown), params))
-    for part in drawn:
-        corner = grid.col0 + part.left, grid.row0 + part.top
-        window = grid.window(*corner, part.right - part.left, part.bottom - part.top)
-        fresh = render(window, world, frames.overlapping(window, world), photos, params)
-        lay(canvas[part.top : part.bottom, part.left : part.right], fresh)
-    return Patched(_touched(grid, canvas, shown, drawn), sum(part.pixels for part in drawn))
+    wanted = _wanted(grid, shown)
+    drawn = holes(grid, world, near, canvas[..., 3], wanted, params)
+    if not drawn.any():
+        return Patched({}, 0)
+    # One cell more all round: there it fades, and there end the photos that surely show the hole.
+    drawn = np.asarray(cv2.dilate(drawn.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool) & wanted)
+    _draw(canvas, grid, world, frames, photos, drawn, params)
+    places = {tile: _place(grid, tile) for tile in shown}
+    fresh = _pixels(drawn)
+    changed = [tile for tile, place in places.items() if fresh[place].any()]
+    encoded = {tile: encode(np.ascontiguousarray(canvas[places[tile]])) for tile in changed}
+    return Patched(encoded, int(drawn.sum()) * CELL_PX**2)
+
+
+def _draw(
+    canvas: Rgba,
+    grid: MercatorGrid,
+    world: World,
+    frames: FrameIndex,
+    photos: Photos,
+    drawn: Mask,
+    params: FusionParams,
+) -> None:
+    """Draws these cells onto the canvas, beside what it shows."""
+    rows, cols = np.flatnonzero(drawn.any(1)), np.flatnonzero(drawn.any(0))
+    cells = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+    place = (
+        slice(cells[0].start * CELL_PX, cells[0].stop * CELL_PX),
+        slice(cells[1].start * CELL_PX, cells[1].stop * CELL_PX),
+    )
+    corner = grid.col0 + place[1].start, grid.row0 + place[0].start
+    window = grid.window(*corner, place[1].stop - place[1].start, place[0].stop - place[0].start)
+    fresh = render(window, world, frames.overlapping(window, world), photos, params, drawn[cells])
+    fresh[~_pixels(drawn[cells])] = 0
+    lay(canvas[place], fresh)
 
 
 def holes(
@@ -113,44 +123,6 @@ def _sees(frame: PosedFrame, ground: Array, cell_m: float, params: FusionParams)
     return np.asarray(ahead & ((uv >= margin) & (uv <= size - 1 - margin)).all(1))
 
 
-def parts(empty: Mask, cuts: int = MOST_CUTS) -> list[Part]:
-    """Few rectangles, with room to fade, that hold all these cells and not many others."""
-    whole = _around(empty)
-    if whole is None:
-        return []
-    best, cut = whole.pixels - WORTH_A_CUT_PX, None
-    loose = int(empty.sum()) * CELL_PX**2 < best
-    for axis in range(2 if cuts and loose else 0):
-        for place in range(STEP_CELLS, empty.shape[axis], STEP_CELLS):
-            halves = [_around(h) for h in _cut(empty, axis, place)]
-            pixels = sum(h.pixels for h in halves if h is not None)
-            if None not in halves and pixels < best:
-                best, cut = pixels, (axis, place)
-    if cut is None:
-        return [whole]
-    return [part for half in _cut(empty, *cut) for part in parts(half, cuts - 1)]
-
-
-def _cut(cells: Mask, axis: int, place: int) -> tuple[Mask, Mask]:
-    low, high = cells.copy(), cells.copy()
-    np.moveaxis(low, axis, 0)[place:] = False
-    np.moveaxis(high, axis, 0)[:place] = False
-    return low, high
-
-
-def _around(cells: Mask) -> Part | None:
-    rows, cols = np.flatnonzero(cells.any(1)), np.flatnonzero(cells.any(0))
-    if not len(rows):
-        return None
-    height, width = cells.shape[0] * CELL_PX, cells.shape[1] * CELL_PX
-    return Part(
-        max(int(cols[0]) * CELL_PX - FADE_PX, 0),
-        max(int(rows[0]) * CELL_PX - FADE_PX, 0),
-        min((int(cols[-1]) + 1) * CELL_PX + FADE_PX, width),
-        min((int(rows[-1]) + 1) * CELL_PX + FADE_PX, height),
-    )
-
-
 def lay(shown: Rgba, fresh: Rgba) -> None:
     """Puts a fresh picture where nothing is shown, in place; it fades out over the `FADE_PX` beyond."""
     known = shown[..., 3] > 0
@@ -179,15 +151,8 @@ def _wanted(grid: MercatorGrid, tiles: Iterable[TileKey]) -> Mask:
     return pixels[::CELL_PX, ::CELL_PX]
 
 
-def _touched(
-    grid: MercatorGrid, canvas: Rgba, shown: Iterable[TileKey], drawn: Sequence[Part]
-) -> dict[TileKey, Encoded | None]:
-    fresh = np.zeros(canvas.shape[:2], bool)
-    for part in drawn:
-        fresh[part.top : part.bottom, part.left : part.right] = True
-    places = {tile: _place(grid, tile) for tile in shown}
-    changed = [tile for tile, place in places.items() if fresh[place].any()]
-    return {tile: encode(np.ascontiguousarray(canvas[places[tile]])) for tile in changed}
+def _pixels(cells: Mask) -> Mask:
+    return np.asarray(np.kron(cells, np.ones((CELL_PX, CELL_PX), bool)))
 
 
 def _place(grid: MercatorGrid, tile: TileKey) -> tuple[slice, slice]:

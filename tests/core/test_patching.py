@@ -2,13 +2,11 @@
 
 import cv2
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from core.coverage import block_grid, blocks, pass_pixels, tiles_under
 from core.fusion import FrameIndex, render
 from core.geometry import Camera, Pose, PosedFrame, World
-from core.patching import CELL_PX, FADE_PX, fill_block, lay, parts
+from core.patching import CELL_PX, FADE_PX, fill_block, lay
 from core.pyramid import decode
 
 WORLD = World(47.0, 8.0, 400.0)
@@ -74,8 +72,8 @@ def test_a_map_that_is_filled_photo_by_photo_has_no_holes_and_costs_little_more_
             whole[top : top + 512, left : left + 512] = 0
         missing += int(((whole > 0) & (alpha == 0)).sum())
     seen = sum(int((alpha_of(block_grid([t]), {t: p}) > 0).sum()) for t, p in shown.items())
-    assert missing < 0.01 * seen  # slivers along the photos' edges
-    assert spent < 1.0 * pass_pixels(shown)
+    assert missing < 0.02 * seen  # slivers along the photos' edges
+    assert spent < 0.9 * pass_pixels(shown)
 
 
 def test_what_is_shown_fades_into_what_is_new_and_stays_as_it_was_beyond():
@@ -100,27 +98,17 @@ def test_where_the_fresh_picture_shows_nothing_the_old_one_stays():
     assert (shown == before).all()
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 63), st.integers(0, 63), st.integers(1, 30), st.integers(1, 30)),
-        max_size=4,
-    )
-)
-def test_parts_hold_every_hole_and_never_more_than_one_rectangle_around_all(boxes):
-    empty = np.zeros((64, 64), bool)
-    for x, y, width, height in boxes:
-        empty[y : y + height, x : x + width] = True
-    found = parts(empty)
-    held = np.zeros((1024, 1024), bool)
-    for part in found:
-        held[part.top : part.bottom, part.left : part.right] = True
-    wanted = np.kron(empty, np.ones((CELL_PX, CELL_PX), bool))
-    assert not (wanted & ~held).any()
-    assert sum(p.pixels for p in found) <= sum(p.pixels for p in parts(empty, cuts=0))
-
-
-def test_far_corners_are_two_parts():
-    empty = np.zeros((64, 64), bool)
-    empty[:5, :5] = empty[-5:, -5:] = True
-    assert len(parts(empty)) == 2
+def test_only_the_wanted_cells_are_drawn_as_in_the_whole_picture():
+    frames, album = flight(), Album()
+    block = blocks(tiles_under(frames[7], WORLD, ZOOM))[0]
+    grid = block_grid(block)
+    near = FrameIndex(frames).overlapping(grid, WORLD)
+    whole = render(grid, WORLD, near, album)
+    only = np.zeros((grid.height // CELL_PX, grid.width // CELL_PX), bool)
+    rng = np.random.default_rng(1)
+    only[5:9, 3:20] = only[12:14, 12:14] = True
+    only |= rng.uniform(size=only.shape) < 0.02
+    part = render(grid, WORLD, near, album, only=only)
+    pixels = np.kron(only, np.ones((CELL_PX, CELL_PX), bool))
+    assert (part[pixels] == whole[pixels]).all()
+    assert (part[..., 3] > 0).sum() < (whole[..., 3] > 0).sum()
