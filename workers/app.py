@@ -27,7 +27,7 @@ from services.database import Database
 from services.errors import LeaseLost, MissionNotFound
 from services.logging import configure_logging
 from services.processes import WARM, die_with
-from services.queue import make_celery
+from services.queue import make_celery, send
 from services.settings import get_settings
 from services.storage import get_store
 
@@ -42,6 +42,9 @@ log = structlog.get_logger("workers")
 MAX_ATTEMPTS = 4
 CLAIM_TTL_S = settings.stalled_after_s
 """A tile that was handed out is handed out again after this time."""
+
+
+_stages: dict[str, Callable[..., None]] = {}
 
 
 def stage(name: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
@@ -63,9 +66,21 @@ def stage(name: str) -> Callable[[Callable[P, None]], Callable[P, None]]:
                 log.exception("stage failed", stage=name, args=[str(a)[:80] for a in args])
 
         app.task(name=name)(run)
+        _stages[name] = run
         return work
 
     return register
+
+
+def go_on(name: str, *args: Any) -> None:
+    """What follows, here and now if this worker serves that stage too, else by a wake-up.
+
+    The task that goes on is acknowledged when both are done: cut off, it is done again, and goes on again.
+    """
+    if name in _stages:
+        _stages[name](*args)
+    else:
+        send(name, *args)
 
 
 class Stopwatch:

@@ -14,10 +14,9 @@ from services.catalog import backlog, missions, poses, tiles
 from services.catalog.backlog import ToDraw
 from services.catalog.poses import Poses
 from services.catalog.tiles import Key, Render, TileBox
-from services.queue import send
 from services.tables import Mission
 from workers import warmup
-from workers.app import Stopwatch, before_the_fork, db, settings, stage, store
+from workers.app import Stopwatch, before_the_fork, db, go_on, settings, stage, store
 from workers.photos import MissionPhotos, shelf
 from workers.pictures import Pictures, put_tile
 
@@ -42,7 +41,7 @@ def fuse(mission_id: str, keys: Sequence[Sequence[int]]) -> None:
             tiles.record_renders(tx, mission_id, renders)
             missions.count_pixels(tx, mission_id, pixels)
             clock.spend(tx, mission_id, "fuse")
-    send("publish", mission_id)
+    go_on("publish", mission_id)
 
 
 def _box(block: Sequence[TileKey]) -> TileBox:

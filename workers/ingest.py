@@ -15,7 +15,7 @@ from services.catalog import frames
 from services.errors import OutOfDisk
 from services.queue import send
 from services.tables import Frame
-from workers.app import MAX_ATTEMPTS, Stopwatch, db, log, settings, stage, store
+from workers.app import MAX_ATTEMPTS, Stopwatch, db, go_on, log, settings, stage, store
 from workers.photos import features_key, photo_key
 
 
@@ -51,7 +51,7 @@ def ingest(mission_id: str, frame_id: str) -> None:
                 clock.spend(tx, mission_id, "ingest")
     elif frame.state != "ready":
         return
-    send("match", mission_id, frame_id)
+    go_on("match", mission_id, frame_id)
 
 
 @contextmanager

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
+from sqlalchemy.orm import Session
+
 from core.matching import match_pair
 from core.neighbours import NeighbourParams, Sighting, candidates_of
-from services.catalog import frames, missions, pairs
+from services.catalog import backlog, frames, missions, pairs
 from services.catalog.frames import Seen
 from services.catalog.pairs import Key, PairResult
 from services.queue import send
 from workers.app import Stopwatch, db, stage
 from workers.photos import shelf
 
-LIVE = NeighbourParams(nearest=6, alike=2)
-"""While photos come in, a few neighbours each hold them; the final solve asks for the pairs that it wants."""
+LIVE = NeighbourParams(nearest=4, sectors=4, before_and_after=1, alike=2)
+"""While photos come in, a few neighbours each hold them; the final solve asks for the pairs that it wants.
+
+Who is near changes with every photo: what more is asked for now, nobody may want in the end.
+"""
+CALM_S = 0.5
+_REMEMBERED = 8
+
+_seen: OrderedDict[str, dict[str, Seen]] = OrderedDict()
 
 
 @stage("match")
@@ -24,7 +34,7 @@ def match(mission_id: str, frame_id: str | None, wanted: Sequence[Key] = ()) -> 
     clock = Stopwatch()
     with db.read() as tx:
         mode = missions.get(tx, mission_id).mode
-        seen = {s.frame_id: s for s in frames.sightings(tx, mission_id)}
+        seen = _look(tx, mission_id)
     if frame_id is not None:
         if frame_id not in seen or seen[frame_id].state != "ready":
             send("sequence", mission_id)
@@ -38,7 +48,18 @@ def match(mission_id: str, frame_id: str | None, wanted: Sequence[Key] = ()) -> 
         if frame_id is not None:
             frames.mark_matched(tx, mission_id, frame_id)
         clock.spend(tx, mission_id, "match")
-    send("sequence", mission_id)
+        news = frame_id is None or backlog.is_news(tx, mission_id, frame_id, CALM_S)
+    if news:
+        send("sequence", mission_id)
+
+
+def _look(tx: Session, mission_id: str) -> dict[str, Seen]:
+    """The frames that were read; of those that this process knows only the states are fetched."""
+    known = _seen.pop(mission_id, {})
+    while len(_seen) >= _REMEMBERED:
+        _seen.popitem(last=False)
+    _seen[mission_id] = seen = {s.frame_id: s for s in frames.sightings(tx, mission_id, known)}
+    return seen
 
 
 def sighting(mission_id: str, seen: Seen) -> Sighting:

@@ -46,6 +46,8 @@ IDLE = Backlog(0, 0, 0, 0, 0)
 
 _known: dict[str, Known] = {}
 _asked: dict[tuple[str, PairKey], float] = {}
+_expected: dict[str, tuple[int, float]] = {}
+"""How many pairs must be there before those that the final solve asked for can be; and how long it waits."""
 _come_back: dict[str, float] = {}
 _rested: dict[str, float] = {}
 
@@ -78,8 +80,19 @@ def _waits(mission_id: str) -> bool:
         desk = backlog.of(tx, mission_id, CLAIM_TTL_S)
     if mission.state == "finalising" and 0 < desk.unread < WORTH_A_LOOK:
         return False  # the last of them wakes us
+    if mission.state == "finalising" and not desk.unread and _pairs_missing(mission_id):
+        return False
     resting = desk.unread > settings.workers and time.monotonic() < _rested.get(mission_id, 0.0)
     return not (resting and mission.state == "finalising")
+
+
+def _pairs_missing(mission_id: str) -> bool:
+    """Whether pairs that the final solve asked for cannot be there yet: every task of theirs wakes us."""
+    enough, until = _expected.get(mission_id, (0, 0.0))
+    if time.monotonic() > until:
+        return False
+    with db.read() as tx:
+        return pairs.computed(tx, mission_id) < enough
 
 
 def _come_back_later(mission_id: str) -> None:
@@ -298,6 +311,7 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
     known = Known(generation, layout, len(graph), found.reprojection_rms_px, graph)
     known.solved_located = known.located(graph)
     _known[mission.id] = known
+    _expected.pop(mission.id, None)
     log.info("solved finally", mission=mission.id, frames=len(graph), posed=len(layout.frames))
     return True
 
@@ -320,8 +334,9 @@ def _matched(mission_id: str, wanted: set[PairKey]) -> list[PairMatch] | None:
 def _all_matched(mission_id: str, wanted: set[PairKey]) -> bool:
     """Whether all these pairs are computed; asks for those that are not."""
     with db.read() as tx:
-        missing = sorted(wanted - set(pairs.keys(tx, mission_id, "done")))
-    now = time.monotonic()
+        done = set(pairs.keys(tx, mission_id, "done"))
+    missing, now = sorted(wanted - done), time.monotonic()
+    _expected[mission_id] = (len(done) + len(missing), now + ASK_AGAIN_S)
     ask = [p for p in missing if _asked.get((mission_id, p), 0.0) < now]
     for start in range(0, len(ask), PAIRS_PER_TASK):
         send("match", mission_id, None, ask[start : start + PAIRS_PER_TASK])

@@ -44,6 +44,20 @@ def of(tx: Session, mission_id: str, ttl_s: float, now: float | None = None) -> 
     return Backlog(unread, frames.get("matched", 0), in_flight, to_render, to_publish)
 
 
+def is_news(tx: Session, mission_id: str, frame_id: str, calm_s: float) -> bool:
+    """Whether to wake the sequencer for this frame, which was matched just now.
+
+    Not for one of many: the first of every `calm_s` wakes it, and the last that there is to match.
+    """
+    at = tx.scalar(select(Frame.matched_at).where(Frame.mission_id == mission_id, Frame.id == frame_id))
+    since = (at or 0.0) // calm_s * calm_s
+    waiting = (Frame.state == "matched") & (Frame.id != frame_id) & (Frame.matched_at >= since)
+    unread = Frame.state.in_(("received", "ready"))
+    query = select(func.count().filter(waiting), func.count().filter(unread))
+    others, still_to_come = tx.execute(query.where(Frame.mission_id == mission_id)).one()
+    return not others or not still_to_come
+
+
 @dataclass(frozen=True, slots=True)
 class ToDraw:
     """A dirty tile: the `generation` that its new picture will show, and what it shows so far, if anything.

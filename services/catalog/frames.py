@@ -258,17 +258,24 @@ def list(
     return tx.scalars(query.order_by(Frame.received_at, Frame.id).limit(limit)).all()
 
 
-def sightings(tx: Session, mission_id: str) -> Sequence[Seen]:
-    """Every frame that could be read, by id: also those that the pose graph could not place yet."""
+def sightings(tx: Session, mission_id: str, known: Mapping[str, Seen] | None = None) -> Sequence[Seen]:
+    """Every frame that could be read, by id: also those that the pose graph could not place yet.
+
+    `known`: frames that need not be read again, for what was read of a photo never changes.
+    """
+    known = known or {}
     query = (
-        select(Frame.id, Frame.name, Frame.state, Frame.meta)
+        select(Frame.id, Frame.name, Frame.state)
         .where(Frame.mission_id == mission_id, Frame.meta.is_not(None))
         .where(or_(Frame.state != "rejected", Frame.matched_at.is_not(None)))
         .order_by(Frame.id)
     )
-    return [
-        Seen(i, name, state, FrameMeta.from_json(meta or {})) for i, name, state, meta in tx.execute(query)
-    ]
+    rows = [(i, name, state) for i, name, state in tx.execute(query)]
+    metas = {i: known[i].meta for i, _, _ in rows if i in known}
+    for some in chunks([i for i, _, _ in rows if i not in known]):
+        fresh = select(Frame.id, Frame.meta).where(Frame.mission_id == mission_id, Frame.id.in_(some))
+        metas |= {i: FrameMeta.from_json(meta or {}) for i, meta in tx.execute(fresh)}
+    return [Seen(i, name, state, metas[i]) for i, name, state in rows]
 
 
 def latencies_s(tx: Session, mission_id: str) -> Sequence[float]:

@@ -120,6 +120,12 @@ def keys(tx: Session, mission_id: str, state: str | None = None) -> Sequence[Key
     return [(low, high) for low, high in tx.execute(query.order_by(Pair.low, Pair.high))]
 
 
+def computed(tx: Session, mission_id: str) -> int:
+    """How many pairs have a result."""
+    query = select(func.count()).where(Pair.mission_id == mission_id, Pair.state == "done")
+    return tx.scalar(query) or 0
+
+
 def accepted(tx: Session, mission_id: str, touching: Collection[str] | None = None) -> Sequence[bytes]:
     """The matches of the accepted pairs, sorted by (low, high); `touching`: only those of these frames."""
     if touching is None:

@@ -126,7 +126,8 @@ def bench(modules: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Bench:
     with modules["app"].db.write() as tx:
         found = Bench(modules, missions.create(tx, "bench").id)
     for name in STAGES:
-        monkeypatch.setattr(modules[name], "send", found.send, raising=False)
+        for how in ("send", "go_on"):
+            monkeypatch.setattr(modules[name], how, found.send, raising=False)
     return found
 
 

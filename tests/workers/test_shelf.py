@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -60,3 +62,15 @@ def test_the_pyramid_ends_two_zooms_above_the_tile_that_shows_all() -> None:
         expected = encode(reduce(below))
         assert expected is not None
         assert data == expected[0]
+
+
+def test_a_stage_goes_on_in_this_process_when_it_serves_the_next_one(
+    modules: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app, done, sent = modules["app"], list[Any](), list[Any]()
+    monkeypatch.setattr(app, "_stages", {"match": lambda *args: done.append(args)})
+    monkeypatch.setattr(app, "send", lambda *args: sent.append(args))
+    app.go_on("match", "mission", "frame")
+    app.go_on("sequence", "mission")
+    assert done == [("mission", "frame")]
+    assert sent == [("sequence", "mission")]
