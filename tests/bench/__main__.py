@@ -1,9 +1,10 @@
-"""Measures the whole program as a user runs it; one line of JSON a flight.
+"""Measures the whole program as a user runs it, and its poses against the truth; one line of JSON a flight.
 
 python -m tests.bench flight DIR [DIR …]     `orthostream run` on folders of photos
-python -m tests.bench simulated              a simulated flight of known truth
-Both take --cores (for taskset), --max-side, --pace (photos a second), --out, and --tools: a folder with
-overlap_ncc.py, gcp_error.py and score_mosaic.py, whose lines are added to the figures.
+python -m tests.bench rendered               `orthostream run` on a simulated flight of known truth
+python -m tests.bench simulated              poses in every situation of a flight (--frames, --seeds)
+The first two take --cores (for taskset), --max-side, --pace (photos a second), --out, and --tools: a folder
+with overlap_ncc.py, gcp_error.py and score_mosaic.py, whose lines are added to the figures.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from tests.bench.situations import situations
 from tests.bench.watch import watch
 
 PROGRAM = [str(Path(sys.executable).with_name("orthostream"))]
@@ -91,7 +93,7 @@ def flight(photos: Path, options: argparse.Namespace) -> dict[str, Any]:
     return figures
 
 
-def simulated(options: argparse.Namespace) -> dict[str, Any]:
+def rendered(options: argparse.Namespace) -> dict[str, Any]:
     """A flight of known truth: simulated, mapped, held against its own ground."""
     photos, out = options.out / "simulated-photos", options.out / "simulated"
     shutil.rmtree(photos, ignore_errors=True)
@@ -106,12 +108,18 @@ def simulated(options: argparse.Namespace) -> dict[str, Any]:
     )
 
 
+def seeds(text: str) -> range:
+    """A range of seeds as `--seeds` names it."""
+    first, _, last = text.partition("-")
+    return range(int(first), int(last or first) + 1)
+
+
 def main() -> None:
     """Reads the arguments and prints one line of JSON a flight."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("flight", "simulated"))
+    parser.add_argument("what", choices=("flight", "rendered", "simulated"))
     parser.add_argument("photos", nargs="*", type=Path)
     parser.add_argument("--cores", default="0,1")
     parser.add_argument("--max-side", type=int)
@@ -121,10 +129,16 @@ def main() -> None:
     parser.add_argument(
         "--simulate", default="--frames 200 --gps-noise-m 2", help="options of `orthostream simulate`"
     )
+    parser.add_argument("--frames", type=int, default=200, help="of the simulated flights")
+    parser.add_argument("--seeds", type=seeds, default=range(5), help="of the simulated flights: 3 or 0-19")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
     if options.what == "simulated":
-        print(json.dumps(simulated(options)), flush=True)
+        for line in situations(options.frames, options.seeds):
+            print(json.dumps(line), flush=True)
+        return
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.what == "rendered":
+        print(json.dumps(rendered(options)), flush=True)
     for photos in options.photos:
         print(json.dumps(flight(photos, options)), flush=True)
 

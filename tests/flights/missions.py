@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from pyproj import Transformer
@@ -13,13 +14,15 @@ from pyproj import Transformer
 from core.features import Features
 from core.frame import FrameMeta
 from core.geometry import Array, World
-from core.matching import PairMatch, match_pair
+from core.matching import MatchCounts, PairMatch, match_pair
 from core.neighbours import Pair, Sighting
 from core.pose_graph import GraphFrame, PoseParams, Solution, solve
 from core.simulation import Flight, FlightParams, Shot, plan_flight
 from core.submaps import SubmapGraph, submap_graph
 from core.ties import Canonical, canonical
 from tests.flights.landmarks import LandmarkParams, features
+
+NONE = np.zeros((0, 2), np.float32)
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,19 @@ class Mission:
         return Mission(self.flight, self.shots, kept, self.features, self.known)
 
 
+def interrupted(m: Mission, times: int, reach: int = 8) -> Mission:
+    """All photos, but tracking is lost so many times (Zhan 2021, table 2): no photo of the last `reach`
+    before an interruption matches one of the first `reach` after it.
+    """
+    order = list(m.shots)
+    refused = dict(m.known)
+    for at in (round((k + 1) * len(order) / (times + 1)) for k in range(times)):
+        for before, after in product(order[max(at - reach, 0) : at], order[at : at + reach]):
+            low, high = sorted((before, after))
+            refused[low, high] = PairMatch(low, high, False, "too_few_matches", NONE, NONE, MatchCounts())
+    return Mission(m.flight, m.shots, m.frames, m.features, refused)
+
+
 def frame_id(shot: Shot) -> str:
     """Photos without bytes need an id as well."""
     return hashlib.sha256(shot.name.encode()).hexdigest()[:32]
@@ -98,6 +114,17 @@ def mission(params: FlightParams, seen: LandmarkParams | None = None) -> Mission
     shots = {frame_id(s): s for s in flight.shots}
     frames = tuple(GraphFrame(k, s.name, meta_of(params, s)) for k, s in shots.items())
     return Mission(flight, shots, frames, dict(zip(shots, features(flight, seen), strict=True)))
+
+
+def reclaimed(m: Mission, params: FlightParams) -> Mission:
+    """The same pictures with the claims of a flight whose truth is the same."""
+    flight = plan_flight(params)
+    shots = {frame_id(s): s for s in flight.shots}
+    assert {k: s.pose.center.tolist() for k, s in shots.items()} == {
+        k: s.pose.center.tolist() for k, s in m.shots.items()
+    }
+    frames = tuple(GraphFrame(k, s.name, meta_of(params, s)) for k, s in shots.items())
+    return Mission(flight, shots, frames, m.features, m.known)
 
 
 def meta_of(params: FlightParams, shot: Shot) -> FrameMeta:
@@ -157,9 +184,8 @@ def center_errors_m(m: Mission, solution: Solution) -> Array:
 
 
 def sigmas_m(m: Mission, solution: Solution) -> Array:
-    """As stated for the frames of `center_errors_m`, (N, 3) metres."""
-    stated = [solution.poses[k].sigma_m for k in posed(m, solution)]
-    return np.array([s for s in stated if s is not None])
+    """As stated for the frames of `center_errors_m`, (N, 3) metres; NaN where nothing is stated."""
+    return np.array([solution.poses[k].sigma_m or (np.nan,) * 3 for k in posed(m, solution)])
 
 
 def height_errors(m: Mission, solution: Solution) -> Array:
