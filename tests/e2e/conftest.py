@@ -203,17 +203,18 @@ class Mission:
                 frames.mark_ready(tx, self.mission_id, shot.frame_id, shot.meta)
                 frames.mark_matched(tx, self.mission_id, shot.frame_id)
 
-    def pose(self, shots: Sequence[Shot]) -> None:
+    def save(self, change: PoseUpdate) -> None:
         with self.service.db.write() as tx:
             if not self.epoch:
                 self.epoch = leases.acquire(tx, self.mission_id, "test", 3600) or 0
-            placed = [Placed(s.frame_id, "simulated",
-                             s.pose, _box(s)) for s in shots]  # fmt: skip
-            dirty = {tuple(t): 0 for s in shots for t in _under(s)}
-            poses.save(
-                tx, self.mission_id, self.epoch,
-                PoseUpdate(placed=placed, dirty=dirty, cameras={"simulated": CAMERA}, world=WORLD, zoom=ZOOM),
-            )  # fmt: skip
+            poses.save(tx, self.mission_id, self.epoch, change)
+
+    def pose(self, shots: Sequence[Shot]) -> None:
+        placed = [Placed(s.frame_id, "simulated", s.pose, _box(s)) for s in shots]
+        dirty = {tuple(t): 0 for s in shots for t in _under(s)}
+        self.save(
+            PoseUpdate(placed=placed, dirty=dirty, cameras={"simulated": CAMERA}, world=WORLD, zoom=ZOOM)
+        )
         self.posed += shots
 
     def publish(self) -> int:

@@ -15,7 +15,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from core.errors import TruncatedImage
-from services.catalog import exports, frames
+from services.catalog import exports, frames, missions
+from services.catalog.poses import PoseUpdate
 
 if TYPE_CHECKING:
     from conftest import Mission, Service, Shot
@@ -227,9 +228,12 @@ def test_photos_go_up_from_the_browser(page: Page, service: Service, tmp_path: P
     picture(page, "8-missions")
 
 
-def test_a_refusal_is_listed_though_its_event_never_comes(page: Page, service: Service, mission: Mission) -> None:
+def test_a_refusal_is_listed_though_its_event_never_comes(
+    page: Page, service: Service, mission: Mission
+) -> None:
     """The count may come with the mission's document before its event does."""
-    page.route("**/events*", lambda route: route.fulfill(content_type="text/event-stream", body=": nothing\n\n"))
+    quiet = {"content_type": "text/event-stream", "body": ": nothing\n\n"}
+    page.route("**/events*", lambda route: route.fulfill(**quiet))
     page.goto(mission.url)
     stat(page, "Rejected")("0")
     page.wait_for_load_state("networkidle")
@@ -238,6 +242,76 @@ def test_a_refusal_is_listed_though_its_event_never_comes(page: Page, service: S
     stat(page, "Rejected")("1")
     page.locator("summary", has_text="Rejected photos").click()
     expect(page.locator("ul.rejected")).to_contain_text("DJI_0043.JPG")
+
+
+SUBMAPS = {
+    "submaps": [
+        {"index": 0, "submap": 0, "frames": 14, "drone": "Drone 1", "georeferenced_by": "gps"},
+        {"index": 1, "submap": 0, "frames": 14, "drone": "Drone 2", "georeferenced_by": "tie"},
+        {"index": 2, "submap": 5, "frames": 13, "drone": "Drone 3", "georeferenced_by": "none"},
+        {"index": 3, "submap": None, "frames": 1, "drone": "Drone 3", "georeferenced_by": "none"},
+    ],
+    "ties": [
+        {
+            "low": 0,
+            "high": 1,
+            "strength": 61.4,
+            "frames": 9,
+            "points": 377,
+            "angle_deg": 12.1,
+            "accepted": True,
+        }
+    ],
+    "tried_pairs": 12,
+    "dropped_pairs": 0,
+}
+
+
+def test_what_waits_for_a_tie_is_told_and_submaps_are_listed(
+    page: Page, mission: Mission, shots: list[Shot]
+) -> None:
+    mission.fly([s for s in shots if s.meta.drone != "Drone 3"])
+    late = [s for s in shots if s.meta.drone == "Drone 3"]
+    mission.receive([replace(s, meta=replace(s.meta, gps=None)) for s in late])
+    page.goto(mission.url)
+    expect(page.locator(".notice")).to_be_hidden()
+    mission.save(PoseUpdate(waiting={s.frame_id: s.pose for s in late}, submaps=SUBMAPS))
+    expect(page.locator(".notice")).to_contain_text("14 photos without GPS wait for a tie")
+    expect(page.locator(".headline")).to_have_text("28of 42 photos on the map")
+    stat(page, "Rejected")("0")
+    page.locator("summary", has_text="Submaps").click()
+    rows = page.locator(".submaps .rows").first.locator("li")
+    expect(rows).to_have_text(
+        [
+            re.compile("1.*Drone 1.*14 photos.*by GPS"),
+            re.compile("2.*Drone 2.*14 photos.*by a tie"),
+            re.compile("3.*Drone 3.*13 photos.*waits for a tie"),
+            "and 1 photo in 1 smaller submap",
+        ]
+    )
+    expect(page.locator(".submaps .rows").last).to_contain_text("1 – 2strength 61")
+    settle(page)
+    picture(page, "15-waiting-and-submaps")
+    page.locator(".submaps .rows").last.scroll_into_view_if_needed()
+    picture(page, "17-ties")
+    mission.pose(late)  # a photo that saw both came in
+    expect(page.locator(".notice")).to_be_hidden()
+
+
+def test_a_map_without_gps_says_so_and_takes_a_first_height(
+    page: Page, service: Service, mission: Mission, shots: list[Shot]
+) -> None:
+    mission.fly([replace(s, pose=replace(s.pose, source="vision-only")) for s in shots[:9]])
+    page.goto(mission.url)
+    notice = page.locator(".notice")
+    expect(notice).to_contain_text("Not georeferenced. No photo has GPS: place, north and scale are assumed.")
+    page.get_by_label("Height of the first photo above ground, metres").fill("62.5")
+    settle(page)
+    picture(page, "16-not-georeferenced")
+    page.get_by_role("button", name="Set scale").click()
+    expect(notice).to_contain_text("the scale is as it was given")
+    with service.db.read() as tx:
+        assert missions.get(tx, mission.mission_id).scale == {"first_height_m": 62.5, "marker": None}
 
 
 def test_finalising_and_downloads(page: Page, service: Service, mission: Mission, shots: list[Shot]) -> None:

@@ -1,6 +1,6 @@
 /** The HTTP API as the page sees it: types of its documents and one typed fetch. */
 
-export type FrameState = "received" | "ready" | "matched" | "posed" | "fused" | "rejected";
+export type FrameState = "received" | "ready" | "matched" | "posed" | "fused" | "waiting" | "rejected";
 export type MissionState = "open" | "finalising" | "final" | "deleting";
 export type Source = "visual" | "gnss" | "vision-only";
 export type Counts = Record<FrameState, number>;
@@ -10,11 +10,40 @@ export interface Progress {
   counts: Counts;
   total: number;
   revision: number;
+  generation: number;
   tiles: number;
   dirty_tiles: number;
   rate_per_s: number | null;
   latency_s: { p50: number; p95: number } | null;
   reprojection_rms_px: number | null;
+}
+
+export interface Scale {
+  first_height_m: number | null;
+  marker: { photo: string; length_m: number } | null;
+}
+
+export interface SubmapOut {
+  index: number;
+  submap: number | null;
+  frames: number;
+  drone: string;
+  georeferenced_by: "gps" | "tie" | "none";
+}
+
+export interface TieOut {
+  low: number;
+  high: number;
+  strength: number;
+  frames: number;
+  points: number;
+  angle_deg: number;
+  accepted: boolean;
+}
+
+export interface Submaps {
+  submaps: SubmapOut[];
+  ties: TieOut[];
 }
 
 export interface Mission {
@@ -24,6 +53,8 @@ export interface Mission {
   state: MissionState;
   created_at: number;
   zoom: number | null;
+  scale: Scale | null;
+  georeferenced: boolean | null;
   event_seq: number;
   progress: Progress;
 }
@@ -132,6 +163,13 @@ export const api = {
     }),
   mission: (id: string): Promise<Mission> => request(missionUrl(id)),
   finalise: (id: string): Promise<Mission> => request(missionUrl(id, "/finalise"), { method: "POST" }),
+  setHeight: (id: string, first_height_m: number): Promise<Mission> =>
+    request(missionUrl(id, "/scale"), {
+      method: "PUT",
+      headers: { "content-type": "application/json" },
+      body: JSON.stringify({ first_height_m }),
+    }),
+  submaps: (id: string): Promise<Submaps> => request(missionUrl(id, "/submaps")),
   frames: (id: string): Promise<FramesGeoJson> => request(missionUrl(id, "/frames.geojson")),
   rejected: (id: string): Promise<FramePage> => request(missionUrl(id, "/frames?state=rejected&limit=200")),
   exports: (id: string): Promise<{ exports: ExportDoc[] }> => request(missionUrl(id, "/exports")),

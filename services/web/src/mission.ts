@@ -87,6 +87,8 @@ export class MissionPage {
   private readonly refreshFrames = throttled(() => this.loadFrames());
   private readonly refreshRejected = throttled(() => this.loadRejected());
   private rejectedListed = 0;
+  private submapsAsOf = -1;
+  private readonly refreshSubmaps = throttled(() => this.loadSubmaps());
   private readonly refreshExports = throttled(() => this.loadExports());
   private readonly refreshMission = throttled(() => this.loadMission());
 
@@ -97,6 +99,7 @@ export class MissionPage {
       add: (files) => uploads.add(files),
       toggle: (layer, visible) => this.map.toggle(layer, visible),
       share: () => void this.share(),
+      setHeight: (height_m) => void this.setHeight(height_m),
       download: (doc) => void this.download(doc),
     });
     this.followButton = h("button", { class: "follow", hidden: true, onclick: () => this.map.follow() }, icon(ICONS.target), "Show whole map");
@@ -130,6 +133,7 @@ export class MissionPage {
     this.mission = mission;
     this.panel.setMission(mission);
     this.listRejected();
+    this.listSubmaps();
     this.showEmpty();
     if (mission.zoom !== null) void this.map.showTiles(mission.zoom);
     this.refreshExports();
@@ -144,10 +148,14 @@ export class MissionPage {
       },
       frames: () => this.refreshFrames(),
       progress: (progress) => {
-        if (progress.state !== this.mission.progress.state) this.refreshMission();
+        const before = this.mission.progress;
+        // What is georeferenced by GPS stays so; a map without GPS may move to its place with any new poses.
+        const local = !this.mission.georeferenced && progress.generation !== before.generation;
+        if (progress.state !== before.state || local) this.refreshMission();
         this.mission.progress = progress;
-        this.panel.setProgress(progress);
+        this.panel.setMission(this.mission);
         this.listRejected();
+        this.listSubmaps();
         this.showEmpty();
       },
       exports: () => this.refreshExports(),
@@ -185,6 +193,28 @@ export class MissionPage {
     if (this.gone) return;
     this.rejectedListed = told;
     this.panel.setRejected(frames);
+  }
+
+  /** Submaps change with the poses, and poses have a generation. */
+  private listSubmaps(): void {
+    if (this.mission.progress.generation !== this.submapsAsOf) this.refreshSubmaps();
+  }
+
+  private async loadSubmaps(): Promise<void> {
+    const asOf = this.mission.progress.generation;
+    const known = await api.submaps(this.mission.id);
+    if (this.gone) return;
+    this.submapsAsOf = asOf;
+    this.panel.setSubmaps(known);
+  }
+
+  private async setHeight(height_m: number): Promise<void> {
+    try {
+      this.show(await api.setHeight(this.mission.id, height_m));
+      this.say("Scale set");
+    } catch (error) {
+      this.say(error instanceof Problem ? error.message : OFFLINE);
+    }
   }
 
   private async loadExports(): Promise<void> {

@@ -23,6 +23,7 @@ function row({ id, name, state, created_at, progress }: Mission): HTMLElement {
       h("span", { class: "mission-name" }, h("strong", {}, name), h("small", {}, ago(created_at))),
       h("span", { class: "mission-count" },
         h("span", {}, good ? `${fused.toLocaleString("en")} of ${count(good, "photo")} on the map` : "no photos yet",
+          progress.counts.waiting > 0 && h("small", {}, ` · ${progress.counts.waiting} waiting`),
           progress.counts.rejected > 0 && h("em", {}, ` · ${progress.counts.rejected} rejected`)),
         meter),
       h("span", { class: "pill", "data-tone": waiting ? "off" : TONE[state] }, waiting ? "Waiting" : LABEL[state])));

@@ -1,8 +1,10 @@
 /** The mission's panel: what came in, what is on the map, what was refused and why, what can be taken away. */
 
-import { type Counts, type ExportDoc, type Frame, type Mission, type MissionState, type Progress } from "./api";
+import { type Counts, type ExportDoc, type Frame, type Mission, type MissionState, type Progress, type Submaps } from "./api";
 import { fill, h, icon, ICONS, text } from "./dom";
 import { bytes, count, seconds } from "./format";
+import { Notice } from "./notice";
+import { SubmapsSection } from "./submaps";
 
 const STATE: Record<MissionState, [label: string, tone: string]> = {
   open: ["Live", "live"],
@@ -31,6 +33,7 @@ export interface PanelActions {
   add(files: File[]): void;
   toggle(layer: "footprint" | "track", visible: boolean): void;
   share(): void;
+  setHeight(height_m: number): void;
   download(doc: ExportDoc): void;
 }
 
@@ -46,7 +49,7 @@ function legendEntry([label, colour]: LegendEntry): HTMLElement {
 export function reached(counts: Counts): { matched: number; posed: number; fused: number } {
   const fused = counts.fused;
   const posed = counts.posed + fused;
-  return { matched: counts.matched + posed, posed, fused };
+  return { matched: counts.matched + counts.waiting + posed, posed, fused };
 }
 
 function exportNote(doc: ExportDoc, wanted: boolean): string {
@@ -68,6 +71,11 @@ export class Panel {
   private readonly headline = h("strong", { class: "headline-number" }, "0");
   private readonly headlineRest = h("span", { class: "muted" }, "photos on the map");
   private readonly bar = h("div", { class: "bar", role: "img" });
+  private readonly notice: Notice;
+  private readonly submaps = new SubmapsSection();
+  private colours: ReadonlyMap<string, string> = new Map();
+  private hangingTogether: Submaps = { submaps: [], ties: [] };
+  private local = false;
   private readonly stages = {
     uploaded: stat("Uploaded", "Photos that arrived and are safe"),
     matched: stat("Matched", "Compared with their neighbours"),
@@ -95,6 +103,7 @@ export class Panel {
 
   constructor(private readonly actions: PanelActions) {
     this.finalise = h("button", { class: "primary", onclick: () => actions.finalise() }, icon(ICONS.check), "Finalise map");
+    this.notice = new Notice((height_m) => actions.setHeight(height_m));
     this.rejected.append(h("summary", {}, "Rejected photos", this.rejectedCount), this.rejectedList);
     this.root = h("aside", { class: "panel", "aria-label": "Mission" }, this.head(), this.body(), this.foot());
   }
@@ -115,6 +124,7 @@ export class Panel {
       this.offline,
       h("p", { class: "headline" }, this.headline, this.headlineRest),
       this.bar,
+      this.notice.root,
     );
   }
 
@@ -125,6 +135,7 @@ export class Panel {
       h("dl", { class: "figures" }, ...Object.values(this.figures).map((s) => s.root)),
       h("section", { class: "section" }, h("h2", {}, "Layers"),
         this.switch("Photo footprints", "footprint"), this.sources, this.switch("Flight tracks", "track"), this.drones),
+      this.submaps.root,
       this.rejected,
       h("section", { class: "section" }, h("h2", {}, "Downloads"), this.downloads),
     );
@@ -148,7 +159,15 @@ export class Panel {
 
   setMission(mission: Mission): void {
     text(this.title, mission.name);
+    this.local = mission.georeferenced === false;
+    this.notice.set(mission);
+    this.submaps.set(this.hangingTogether, this.local, this.colours);
     this.setProgress(mission.progress);
+  }
+
+  setSubmaps(known: Submaps): void {
+    this.hangingTogether = known;
+    this.submaps.set(known, this.local, this.colours);
   }
 
   setProgress(progress: Progress): void {
@@ -172,7 +191,8 @@ export class Panel {
 
   private setBar({ counts, total }: Progress): void {
     const parts: [string, number][] = [
-      ["fused", counts.fused], ["posed", counts.posed], ["matched", counts.matched + counts.ready + counts.received], ["rejected", counts.rejected],
+      ["fused", counts.fused], ["posed", counts.posed], ["matched", counts.matched + counts.ready + counts.received],
+      ["waiting", counts.waiting], ["rejected", counts.rejected],
     ];
     this.bar.setAttribute("aria-label", parts.map(([name, n]) => `${n} ${name === "matched" ? "under way" : name}`).join(", "));
     if (!this.bar.children.length) for (const [name] of parts) this.bar.append(h("span", { class: name }));
@@ -229,6 +249,8 @@ export class Panel {
     const now = JSON.stringify([drones, sources]);
     if (now === this.lastLegend) return;
     this.lastLegend = now;
+    this.colours = new Map(drones);
+    this.submaps.set(this.hangingTogether, this.local, this.colours);
     fill(this.drones, ...drones.map(legendEntry));
     fill(this.sources, ...sources.map(legendEntry));
   }
