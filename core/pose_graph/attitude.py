@@ -6,6 +6,9 @@ import numpy as np
 
 from core.geometry import Array
 
+CANDIDATES = 200
+AROUND_RAD = 0.35
+
 
 def rotation_of(yaw: Array, pitch: Array, roll: Array) -> Array:
     """world_R_cam (N, 3, 3) of gimbal angles (N,), radians; pitch −π/2 looks straight down."""
@@ -34,7 +37,12 @@ def levelling(down: Array) -> Array:
     return np.stack(rows, 1)
 
 
-def circular_mean(angle: Array) -> tuple[float, float]:
-    """Mean direction of angles (N,), radians, and how well they agree (0 … 1)."""
-    total = np.exp(1j * angle).mean()
-    return float(np.angle(total)), float(np.abs(total))
+def circular_median(angle: Array) -> tuple[float, float]:
+    """The direction with the least absolute differences to angles (N,), radians, refined by the mean of those
+    around it; and the share of them that are around it. Half a turn in less than half of them does nothing.
+    """
+    tried = angle[np.unique(np.linspace(0, len(angle) - 1, min(len(angle), CANDIDATES)).astype(int))]
+    off = np.abs(np.angle(np.exp(1j * (angle[None] - tried[:, None]))))
+    best = int(np.argmin(off.sum(1)))
+    near = off[best] < AROUND_RAD
+    return float(np.angle(np.exp(1j * angle[near]).sum())), float(near.mean())

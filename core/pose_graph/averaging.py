@@ -1,10 +1,9 @@
-"""Start values without attitude: every photo as a complex similarity of the ground (ground = z·p + c).
+"""Places, heights and headings: every photo as a complex similarity of the ground (ground = z·p + c).
 
-For a level camera, p = x − iy of the viewing ray, |z| is the height above ground, arg z the yaw and c the
-ground point below. A match says z_i·p_i + c_i = z_j·p_j + c_j, GPS says c_i: all linear, so that one sparse
-solve finds the global optimum; reweighting takes wrong matches and wrong GPS fixes out. This does for the
-plane what rotation averaging and scale averaging (Zhao 2020, eq. 1–4) do in space, and needs no baseline per
-pair.
+For a camera whose rays were turned level, p = x − iy of the viewing ray, |z| is the height above ground,
+arg z the yaw and c the ground point below. A match says z_i·p_i + c_i = z_j·p_j + c_j, GPS says c_i: all
+linear, so that one sparse solve finds the global optimum; reweighting takes wrong matches and wrong GPS fixes
+out. It is the translation averaging of Zhao 2020, 3.3, with the scales in it, and needs no baseline per pair.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ than building a factor graph of them would.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -32,12 +34,31 @@ def solve_hermitian(
     values = np.concatenate([v.ravel() for v, _, _ in parts])
     rows = np.concatenate([np.broadcast_to(a + row, v.shape).ravel() for v, a, _ in parts])
     cols = np.concatenate([np.broadcast_to(b + col, v.shape).ravel() for v, _, b in parts])
-    H = coo_matrix((values, (rows, cols)), shape=(n * d, n * d)).tocsc()
+    x = _solved(coo_matrix((values, (rows, cols)), shape=(n * d, n * d)), rhs.reshape(-1, 1))
+    return None if x is None else x.reshape(n, d)
+
+
+def laplacian_solve(pairs: IntArray, weight: Array, held: Array, pull: Array, own: Array) -> Array | None:
+    """The x (N, k) that minimises Σ weight·|x_i − x_j − pull|² + Σ held·|x − own|² over pairs and frames, of
+    `pull` (E, k) and `own` (N, k); None where nothing holds a part.
+    """
+    n, (i, j) = len(held), pairs.T
+    diagonal = np.bincount(i, weight, n) + np.bincount(j, weight, n) + held
+    values = np.concatenate((-weight, -weight, diagonal))
+    where = (np.concatenate((i, j, np.arange(n))), np.concatenate((j, i, np.arange(n))))
+    pulled = weight[:, None] * pull
+    net = [np.bincount(i, column, n) - np.bincount(j, column, n) for column in pulled.T]
+    return _solved(coo_matrix((values, where), shape=(n, n)), np.column_stack(net) + held[:, None] * own)
+
+
+def _solved(matrix: coo_matrix, rhs: NDArray[Any]) -> NDArray[Any] | None:
     try:
-        factor = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        factor = splu(
+            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
     except RuntimeError:
         return None
-    x = np.asarray(factor.solve(rhs.ravel())).reshape(rhs.shape)
+    x = np.asarray(factor.solve(rhs))
     return x if np.isfinite(x).all() else None
 
 
@@ -51,13 +72,11 @@ def summed(n: int, pairs: IntArray, first: ComplexArray, second: ComplexArray) -
     return np.ascontiguousarray(out).view(complex).reshape(n, *first.shape[1:])
 
 
-def laplacian_solve(
-    pairs: IntArray, weight: Array, held: Array, pull: ComplexArray, own: ComplexArray
-) -> ComplexArray | None:
-    """The x (N,) that minimises Σ weight·|x_i − x_j − pull|² + Σ held·|x − own|² over pairs and frames."""
-    n = len(held)
-    w = weight.astype(complex)
-    frame = summed(n, pairs, w, w) + held
-    rhs = summed(n, pairs, w * pull, -w * pull) + held * own
-    x = solve_hermitian(pairs, frame[:, None, None], -w[:, None, None], rhs[:, None])
-    return None if x is None else x[:, 0]
+def plane(z: ComplexArray) -> Array:
+    """Complex numbers (N,) as their real and imaginary parts (N, 2)."""
+    return np.ascontiguousarray(z).view(float).reshape(-1, 2)
+
+
+def number(xy: Array) -> ComplexArray:
+    """The inverse of `plane`."""
+    return np.asarray(xy[:, 0] + 1j * xy[:, 1])

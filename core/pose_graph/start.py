@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.geometry import Array
-from core.pose_graph.attitude import circular_mean, level_to_world, levelling, rotation_of
+from core.pose_graph.attitude import circular_median, level_to_world, levelling, rotation_of
 from core.pose_graph.averaging import (
     Moments,
     Similarities,
@@ -24,14 +24,20 @@ from core.pose_graph.matchgraph import flat_rays
 from core.pose_graph.model import PoseParams
 from core.pose_graph.priors import gravity
 from core.pose_graph.residuals import Edges, IntArray, State
+from core.pose_graph.rotations import absolute_rotations, averaged_rotations
 from core.pose_graph.sparse import ComplexArray
 from core.pose_graph.survey import Survey, capture_order
+from core.pose_graph.twoview import TwoViews, two_views
 
 # GPS holds a submap's scale and heading when it knows them better than this (share, radians).
 GPS_HOLDS = 0.15
 HORIZONTAL_RAD = -0.6
 # Where fewer frames (share) have GPS, it places a submap that pairs have shaped.
 WELL_COVERED = 0.9
+# A compass is believed when more than this share of its frames agree.
+MOST = 0.5
+# Cosine of the furthest that averaged rotations may lean from what was expected.
+SANE_TILT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,22 +76,28 @@ def expected_down(s: Survey) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def starting(s: Survey, edges: Edges, submap: IntArray, params: PoseParams) -> Start:
-    """Shapes of all submaps from pairs alone, fixes that contradict them out; then one linear solve for all.
-    Where GPS cannot hold a submap, metadata give its scale and heading.
+    """Shapes of all submaps from pairs alone, fixes that contradict them out; averaged rotations make the
+    rays level; then one linear solve for all. Where GPS cannot hold a submap, metadata give its scale and
+    heading.
     """
+    roots, guess = _roots(edges.pairs, submap), _typical(s.relative_alt_m, params.assumed_height_m)
     level = levelling(expected_down(s)[0])
-    m = moments(*flat_rays(edges, s.cameras, level), edges.starts)
-    roots = _roots(edges.pairs, submap)
-    guess = _typical(s.relative_alt_m, params.assumed_height_m)
-    chain = guess * chained(edges.pairs, *ratios(m), roots, len(s))
-    s = s.without_fixes(_contradicted(s, edges.pairs, m, chain, submap, roots))
+    rays = flat_rays(edges, s.cameras, level)
+    m = moments(*rays, edges.starts)
+    chain = chained(edges.pairs, *ratios(m), roots, len(s))
+    s = s.without_fixes(_contradicted(s, edges.pairs, m, guess * chain, submap, roots))
     count = len(roots)
     held = np.array([_gps_holds(s, submap == k) for k in range(count)])
+    views = two_views(*rays, edges.starts, m, level, edges.pairs)
+    level = _levelled(s, edges, views, held[submap], roots, params)
+    m = moments(*flat_rays(edges, s.cameras, level), edges.starts)
     size = np.bincount(submap, minlength=count)
     whole = held & (np.bincount(submap, s.has_gps, count) >= WELL_COVERED * size)
     gps = np.where(whole[submap] & s.has_gps, s.gps[:, 0] + 1j * s.gps[:, 1], np.nan)
     fixed = np.array([root for k, root in enumerate(roots) if not whole[k]], np.int64)
-    expected = np.where(whole[submap], np.nan, chain)
+    if len(fixed):
+        chain = chained(edges.pairs, *ratios(m), roots, len(s))
+    expected = np.where(whole[submap], np.nan, guess * chain)
     averaged = average(edges.pairs, m, gps, s.gps_sigma, fixed, guess, expected)
     first = first_of_known_height(s, params)
     placed, offset = _georeferenced(s, averaged, submap, held, first, params)
@@ -94,12 +106,24 @@ def starting(s: Survey, edges: Edges, submap: IntArray, params: PoseParams) -> S
     lens = np.array([(c.f_px, c.k1, c.k2) for c in s.cameras])
     R = level_to_world(-np.angle(placed.z)) @ level
     state = State(R, centre, ground, lens, np.zeros(len(s.drones)))
-    usual = np.array([max(float(np.median(np.abs(placed.z[submap == k]))), 1.0) for k in range(count)])[
-        submap
-    ]
+    typical = [max(float(np.median(np.abs(placed.z[submap == k]))), 1.0) for k in range(count)]
+    usual = np.array(typical)[submap]
     if first is not None and not held[submap[first[0]]]:
         usual[first[0]] = first[1]
     return Start(s, state, held, usual, averaged.error, offset)
+
+
+def _levelled(
+    s: Survey, edges: Edges, views: TwoViews, held: NDArray[np.bool_], roots: list[int], params: PoseParams
+) -> Array:
+    """The rotations (N, 3, 3) that turn each camera's rays level, by rotation averaging."""
+    down, known = expected_down(s)
+    gps = np.where(held & s.has_gps, s.gps[:, 0] + 1j * s.gps[:, 1], np.nan)
+    sigma = np.where(known, params.gimbal_start_rad, params.tilt_start_rad)
+    absolute = absolute_rotations(edges.pairs, views, gps, s.gps_sigma, down, sigma)
+    found = gravity(averaged_rotations(edges.pairs, views, absolute, np.array(roots, np.int64)))
+    sane = np.einsum("ni,ni->n", found, down) > SANE_TILT
+    return levelling(np.where(sane[:, None], found, down))
 
 
 def _roots(pairs: IntArray, submap: IntArray) -> list[int]:
@@ -215,8 +239,8 @@ def yaw_offsets(s: Survey, yaw: Array, trusted: NDArray[np.bool_]) -> Array:
     for d in range(len(s.drones)):
         mine = usable & (s.drone == d)
         if mine.sum() >= 3:
-            mean, agreement = circular_mean(yaw[mine] - s.attitude[mine, 0])
-            offset[d] = mean if agreement > 0.8 else np.nan
+            middle, share = circular_median(yaw[mine] - s.attitude[mine, 0])
+            offset[d] = middle if share > MOST else np.nan
     return offset
 
 
@@ -225,9 +249,9 @@ def _turn(s: Survey, z: ComplexArray, c: ComplexArray, offset: Array, mine: NDAr
     compass = mine & np.isfinite(s.attitude[:, 0])
     if compass.any():
         expected = s.attitude[compass, 0] + np.nan_to_num(offset[s.drone[compass]])
-        mean, agreement = circular_mean(expected + np.angle(z[compass]))
-        if agreement > 0.5:
-            return mean
+        middle, share = circular_median(expected + np.angle(z[compass]))
+        if share > MOST:
+            return middle
     seen = mine & s.has_gps
     if seen.sum() >= 2:
         turn, _ = fit_similarity(c[seen], (s.gps[:, 0] + 1j * s.gps[:, 1])[seen], s.gps_sigma[seen])

@@ -10,11 +10,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from core.frame import FrameMeta
+from core.frame import Attitude, FrameMeta
 from core.matching import MatchCounts, PairMatch
 from core.pose_graph import GraphFrame, Solution, place, solve
+from core.pose_graph.attitude import circular_median, levelling, rotation_of
+from core.pose_graph.averaging import moments
 from core.pose_graph.chaining import spanned
 from core.pose_graph.fixes import contradicted
+from core.pose_graph.residuals import rotations
+from core.pose_graph.rotations import Absolute, absolute_rotations, angles, averaged_rotations, horn
+from core.pose_graph.twoview import TwoViews, two_views
 from core.simulation import Flight, FlightParams, Shot, plan_flight
 
 
@@ -196,3 +201,169 @@ def test_fixes_that_are_all_the_same_contradict_nothing() -> None:
     step = place[pairs[:, 0]] - place[pairs[:, 1]]
     flat = np.full(30, 7.0 + 2j)
     assert not contradicted(flat, np.full(30, 3.0), pairs, step, np.zeros(len(pairs)), place).any()
+
+
+# Rotations (Zhao 2020, eq. 1–4)
+
+
+def off_deg(R: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.degrees(np.linalg.norm(angles(np.einsum("nji,njk->nik", truth, R)), axis=1))
+
+
+def cameras(n: int, seed: int, tilt_deg: float = 6.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    pitch, roll = np.radians(rng.normal(0, tilt_deg, (2, n)))
+    return rotation_of(rng.uniform(-3.1, 3.1, n), pitch - np.pi / 2, roll)
+
+
+def test_rotation_vectors_are_inverted() -> None:
+    turned = np.random.default_rng(0).normal(0, 0.8, (100, 3))
+    np.testing.assert_allclose(angles(rotations(turned)), turned, atol=1e-9)
+
+
+@pytest.mark.parametrize("vectors", [2, 3, 12])
+def test_horn_finds_the_rotation_of_vectors(vectors: int) -> None:
+    rng, n = np.random.default_rng(vectors), 20
+    R, frame = cameras(n, 1), np.repeat(np.arange(n), vectors)
+    seen = rng.normal(0, 10, (len(frame), 3))
+    world = np.einsum("vij,vj->vi", R[frame], seen)
+    weight = rng.uniform(0.1, 3, len(frame))
+    np.testing.assert_allclose(horn(seen, world, weight, frame, n), R, atol=1e-8)
+
+
+def test_horn_is_the_best_of_all_rotations_near_it() -> None:
+    rng = np.random.default_rng(4)
+    seen, world, weight = rng.normal(0, 1, (9, 3)), rng.normal(0, 1, (9, 3)), rng.uniform(0.5, 2, 9)
+    R = horn(seen, world, weight, np.zeros(9, np.int64), 1)[0]
+
+    def gain(R: np.ndarray) -> float:
+        return float((weight * ((seen @ R.T) * world).sum(1)).sum())
+
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    assert all(gain(R) > gain(R @ turn) for turn in rotations(rng.normal(0, 0.2, (50, 3))))
+
+
+def looked(R: np.ndarray, centre: np.ndarray, pairs: np.ndarray, noise: float = 0.0) -> TwoViews:
+    """What pairs of cameras (with a wide lens) over flat ground say, from 30 points each."""
+    rng, rays, starts = np.random.default_rng(0), ([], []), np.arange(len(pairs) + 1) * 30
+    for i, j in pairs:
+        middle = (centre[i] + centre[j]) / 2
+        points = np.column_stack((rng.uniform(-25, 25, (30, 2)) + middle[:2], np.zeros(30)))
+        for side, k in enumerate((i, j)):
+            ray = (points - centre[k]) @ R[k]
+            rays[side].append(
+                (ray[:, 0] - 1j * ray[:, 1]) / ray[:, 2] + rng.normal(0, noise, (30, 2)) @ (1, 1j)
+            )
+    first, second = (np.concatenate(r) for r in rays)
+    level = np.tile(np.eye(3), (len(R), 1, 1))
+    return two_views(first, second, starts, moments(first, second, starts), level, pairs)
+
+
+def block(lines: int, columns: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of a block of photos, metres, and the pairs of those that overlap."""
+    rng = np.random.default_rng(seed)
+    line, column = np.divmod(np.arange(lines * columns), columns)
+    centre = np.column_stack((column * 15.0, line * 25.0, np.full(len(line), 60.0)))
+    centre += rng.normal(0, 1, centre.shape)
+    near = np.hypot(*(centre[:, None, :2] - centre[None, :, :2]).transpose(2, 0, 1)) < 34
+    return centre, np.argwhere(np.triu(near, 1)).astype(np.int64)
+
+
+@pytest.mark.parametrize("tilt_deg", [2.0, 6.0])
+def test_a_pair_over_flat_ground_tells_its_relative_rotation(tilt_deg: float) -> None:
+    centre, pairs = block(4, 6, 3)
+    R = cameras(24, 5, tilt_deg)
+    views = looked(R, centre, pairs, noise=5e-4)
+    truth = np.einsum("eji,ejk->eik", R[pairs[:, 0]], R[pairs[:, 1]])
+    assert np.median(off_deg(views.turn, truth)) < 0.25 * tilt_deg
+    step = np.einsum("eji,ej->ei", R[pairs[:, 0]], centre[pairs[:, 1]] - centre[pairs[:, 0]])
+    across = np.cross(views.step, step)
+    sine = np.linalg.norm(across, axis=1) / np.linalg.norm(views.step, axis=1) / np.linalg.norm(step, axis=1)
+    assert np.median(sine) < 1.6 * np.radians(tilt_deg)
+
+
+def test_gps_gives_every_frame_a_rotation_by_itself() -> None:
+    centre, pairs = block(6, 8, 1)
+    R, rng = cameras(48, 2), np.random.default_rng(3)
+    gps = (centre[:, :2] + rng.normal(0, 1.0, (48, 2))) @ (1, 1j)
+    gps[40:] = np.nan
+    down = np.tile((0.0, 0.0, 1.0), (48, 1))
+    found = absolute_rotations(pairs, looked(R, centre, pairs), gps, np.ones(48), down, np.full(48, 0.3))
+    told = found.heading > 0
+    assert not told[41:].any()
+    assert np.percentile(off_deg(found.R, R)[:40], 90) < 12
+    # averaging with the pairs takes the noise out, and carries headings to where there is no GPS
+    better = averaged_rotations(pairs, looked(R, centre, pairs), found, np.array([0]))
+    assert off_deg(better, R).max() < 4
+    assert np.median(off_deg(better, R)) < 0.6 * np.median(off_deg(found.R, R)[:40])
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("with_gps", [True, False])
+def test_rotations_survive_a_fifth_of_wrong_pairs(share: float, seed: int, with_gps: bool) -> None:
+    rng, (_, pairs) = np.random.default_rng(seed), block(12, 15, seed)
+    n = 180
+    R = cameras(n, seed)
+    noise = rotations(rng.normal(0, 0.01, (len(pairs), 3)))
+    turn = np.einsum("eji,ejk->eik", R[pairs[:, 0]], R[pairs[:, 1]]) @ noise
+    wrong = rng.choice(len(pairs), int(share * len(pairs)), replace=False)
+    turn[wrong] = rotations(rng.normal(0, 1.5, (len(wrong), 3)))
+    views = TwoViews(turn, np.zeros((len(pairs), 3)), np.zeros((len(pairs), 2, 3)), np.zeros(len(pairs)))
+    guessed = rotations(rng.normal(0, 0.1, (n, 3))) @ R
+    heading = np.full(n, 100.0 if with_gps else 0.0)
+    found = averaged_rotations(pairs, views, Absolute(guessed, np.full(n, 25.0), heading), np.array([0]))
+    # without a heading all turn together with the root
+    gauge = np.eye(3) if with_gps else found[0] @ R[0].T
+    assert np.percentile(off_deg(gauge.T @ found, R), 95) < (3.0 if with_gps else 9.0)
+
+
+def test_levelled_rays_point_down() -> None:
+    R = cameras(30, 8, 10.0)
+    down = -R[:, 2]
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", levelling(down), down)[:, 2], 1.0)
+
+
+# Compasses
+
+
+@pytest.mark.parametrize("flipped", [0.0, 0.2, 0.4])
+def test_a_yaw_offset_is_found_through_flips_of_half_a_turn(flipped: float) -> None:
+    rng = np.random.default_rng(6)
+    angle = 0.6 + rng.normal(0, 0.05, 100) + np.pi * (np.arange(100) < 100 * flipped)
+    middle, share = circular_median(angle)
+    assert middle == pytest.approx(0.6, abs=0.03)
+    assert share == pytest.approx(1 - flipped, abs=0.02)
+
+
+def lying_compass(flight: Flown, offset_rad: float, flipped: Collection[int]) -> Flown:
+    def change(k: int, meta: FrameMeta) -> FrameMeta:
+        yaw = meta.attitude.yaw_rad
+        assert yaw is not None
+        lie = yaw - offset_rad + np.pi * (k in flipped)
+        return replace(meta, attitude=replace(meta.attitude, yaw_rad=float(lie)))
+
+    return flight.claiming(change)
+
+
+def test_wrong_yaw_changes_nothing_where_gps_tells_and_its_offset_is_named() -> None:
+    flight = flown(yaw_noise_deg=1.0)
+    honest, told = flight.solve(), lying_compass(flight, 0.5, range(0, 48, 3)).solve()
+    assert apart_m(told, honest) < 0.01
+    shift = told.yaw_offset_rad["drone 1"] - honest.yaw_offset_rad["drone 1"]
+    assert shift == pytest.approx(0.5, abs=0.02)
+
+
+def test_without_gps_the_compass_turns_the_map_in_spite_of_flips() -> None:
+    flight = flown(yaw_noise_deg=1.0).claiming(lambda _, m: replace(m, gps=None))
+    honest, told = flight.solve(), lying_compass(flight, 0.0, range(0, 48, 3)).solve()
+    assert apart_m(told, honest) < 4.0
+
+
+def test_no_attitude_at_all_is_no_loss_where_there_is_gps() -> None:
+    flight = flown()
+    blind = flight.claiming(lambda _, m: replace(m, attitude=Attitude())).solve()
+    assert {p.source for p in blind.poses.values()} == {"visual"}
+    assert blind.dropped_pairs == ()
+    level = [np.degrees(np.arccos(-p.world_R_cam[2, 2])) for p in blind.poses.values()]
+    assert max(level) < 8
