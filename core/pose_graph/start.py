@@ -34,8 +34,8 @@ GPS_HOLDS = 0.15
 HORIZONTAL_RAD = -0.6
 # Where fewer frames (share) have GPS, it places a submap that pairs have shaped.
 WELL_COVERED = 0.9
-# A compass is believed when more than this share of its frames agree.
-MOST = 0.5
+# A compass is believed when more than this share of its frames agree: not when every second strip is flipped.
+MOST = 0.6
 # Cosine of the furthest that averaged rotations may lean from what was expected.
 SANE_TILT = 0.5
 
