@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query
 from pydantic import BaseModel, Field
 
 from services.api.context import MissionId, Services, Use
-from services.catalog import missions, pairs, poses
+from services.catalog import frames, missions, pairs, poses
 
 router = APIRouter(tags=["submaps"])
 
@@ -27,7 +27,7 @@ class SubmapOut(BaseModel):
     """A part of one drone's flight whose first matches hang together; 0 is the largest."""
 
     index: int
-    submap: int | None = Field(description="The connected map it has become part of; null: it has no place")
+    submap: int | None = Field(description="The connected map it has become part of; null: it has no pose")
     frames: int
     drone: str
     georeferenced_by: Literal["gps", "tie", "none"]
@@ -51,6 +51,7 @@ class SubmapsOut(BaseModel):
     maps: list[ConnectedMap]
     submaps: list[SubmapOut]
     ties: list[TieOut]
+    waiting: int = Field(description="Photos that wait, now, for a tie to anything that has a place")
     tried_pairs: int = Field(description="Pairs that were tried in order to tie submaps")
     dropped_pairs: int = Field(description="Accepted pairs that contradict the rest and count for nothing")
     solved_frames: int
@@ -81,11 +82,13 @@ def get_submaps(mission_id: MissionId, services: Use) -> SubmapsOut:
     with services.db.read() as tx:
         row = missions.get(tx, mission_id)
         maps = poses.maps(tx, mission_id)
+        waiting = len(frames.islands(tx, mission_id))
     known = row.submaps or {"submaps": [], "ties": [], "tried_pairs": 0, "dropped_pairs": 0}
     return SubmapsOut.model_validate(
         known
         | {
             "maps": [{"submap": k, "frames": sum(n.values()), "sources": n} for k, n in maps.items()],
+            "waiting": waiting,
             "solved_frames": row.solved_frames,
         }
     )

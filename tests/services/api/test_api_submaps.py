@@ -65,7 +65,8 @@ def match(services: Services, mission_id: str, verdicts: dict[tuple[int, int], s
 
 
 def test_a_new_mission_has_no_submaps(api: TestClient, mission_url: str) -> None:
-    empty = {"maps": [], "submaps": [], "ties": [], "tried_pairs": 0, "dropped_pairs": 0, "solved_frames": 0}
+    nothing = {"tried_pairs": 0, "dropped_pairs": 0, "solved_frames": 0, "waiting": 0}
+    empty = nothing | {"maps": [], "submaps": [], "ties": []}
     assert api.get(f"{mission_url}/submaps").json() == empty
     assert api.get(f"{mission_url}/pairs").json() == {"pairs": [], "next": None}
     report = api.get(f"{mission_url}/report").json()
@@ -77,13 +78,13 @@ def test_submaps_are_those_of_the_last_solve_and_maps_are_as_of_now(
 ) -> None:
     mission_id = mission_of(mission_url)
     pose(services, mission_id, dict.fromkeys(IDS[:3], 0) | {IDS[3]: 4}, submaps=GRAPH, solved_frames=4)
-    pose(services, mission_id, {IDS[4]: 0})
+    pose(services, mission_id, {IDS[4]: 0}, waiting={IDS[3]: None})
     said = api.get(f"{mission_url}/submaps").json()
     assert said == GRAPH | {
         "maps": [
             {"submap": 0, "frames": 4, "sources": {"visual": 4}},
-            {"submap": 4, "frames": 1, "sources": {"gnss": 1}},
         ],
+        "waiting": 1,
         "solved_frames": 4,
     }
     report = api.get(f"{mission_url}/report").json()
