@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class Known:
 
     `solved_located`: frames with GPS in the last solve. `untried`: frames that have not looked for ties with
     other maps yet; `tries`: pairs that were asked for in order to tie maps and are still being matched.
-    `tied`: maps were found to hang together since the last solve.
+    `tied`: maps were found to hang together since the last solve; `scale`: what that had for it.
     """
 
     generation: int
@@ -42,6 +43,7 @@ class Known:
     untried: set[str] = field(default_factory=set)
     tries: set[PairKey] = field(default_factory=set)
     tied: bool = False
+    scale: Mapping[str, Any] | None = None
 
     @classmethod
     def read(cls, poses: Poses, sightings: Iterable[Seen], rms_px: float | None) -> Known:

@@ -137,6 +137,7 @@ def _recall(mission: Mission) -> Known:
             known = Known.read(
                 poses.load(tx, mission.id), frames.sightings(tx, mission.id), mission.reprojection_rms_px
             )
+        known.scale = mission.scale
         while len(_known) >= _REMEMBERED:
             _known.pop(next(iter(_known)))
         _known[mission.id] = known
@@ -151,12 +152,14 @@ def _learn(mission_id: str, known: Known, new_ids: set[str]) -> None:
 
 
 def _tie(mission: Mission, epoch: int, desk: Backlog) -> bool:
-    """Look for ties between maps; whether all was solved again because there are some."""
+    """Look for ties between maps; whether all was solved again because of some, or of another scale."""
     known = _known.get(mission.id)
     if known is None or known.generation != mission.generation:
         return False
     known.tied |= bool(known.tries) and tying.tied(mission.id, known)
-    if known.tied and (desk == IDLE or len(known.homes) >= MERGE_GROWTH * known.solved_frames):
+    known.tied |= known.scale != mission.scale
+    grown = len(known.homes) >= MERGE_GROWTH * known.solved_frames
+    if known.tied and known.homes and (grown or desk == IDLE):
         _pose(mission, epoch, set())
         return True
     if known.untried and desk.unread <= settings.workers:
@@ -232,6 +235,7 @@ def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, 
         submaps=graph.to_json(),
     )
     known.solved_frames, known.reprojection_rms_px, known.tied = total, rms_px, False
+    known.scale = mission.scale
     known.solved_located = known.located(known.seen)
     return after, dirty, update
 
@@ -309,7 +313,7 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
         generation = poses.save(tx, mission.id, epoch, update)
         clock.spend(tx, mission.id, "solve")
     known = Known(generation, layout, len(graph), found.reprojection_rms_px, graph)
-    known.solved_located = known.located(graph)
+    known.solved_located, known.scale = known.located(graph), mission.scale
     _known[mission.id] = known
     _expected.pop(mission.id, None)
     log.info("solved finally", mission=mission.id, frames=len(graph), posed=len(layout.frames))

@@ -136,21 +136,28 @@ def test_a_flight_without_gps_is_a_local_map_to_scale(bench: Any, blind: Photos)
     assert (told["georeferenced"], told["scale"]["used"]) == (False, True)
 
 
-def test_another_scale_opens_a_final_mission_again(bench: Any, blind: Photos) -> None:
+def first_height_m(bench: Any) -> float:
+    with bench.db.read() as tx:
+        known = poses.load(tx, bench.mission_id)
+    first = known.placed[min(known.placed, key=lambda k: names(bench)[k])].pose
+    return float(first.center[2] - first.ground_h_m)
+
+
+def test_another_scale_opens_a_final_mission_again_and_shows_at_once(bench: Any, blind: Photos) -> None:
     finished(bench, blind[:4])
     small = bench.tiles()
     with bench.db.write() as tx:
         assert missions.set_scale(tx, bench.mission_id, KnownScale(120.0))
         assert not missions.set_scale(tx, bench.mission_id, KnownScale(120.0))
     assert bench.state == "open"
+    bench.send("sequence", bench.mission_id)
+    bench.drain()
+    assert first_height_m(bench) == pytest.approx(120.0, rel=0.03)
     bench.finalise()
     bench.drain()
     assert bench.state == "final"
+    assert first_height_m(bench) == pytest.approx(120.0, rel=0.03)
     assert bench.tiles() != small
-    with bench.db.read() as tx:
-        known = poses.load(tx, bench.mission_id)
-    first = known.placed[min(known.placed, key=lambda k: names(bench)[k])].pose
-    assert first.center[2] - first.ground_h_m == pytest.approx(120.0, rel=0.03)
 
 
 def names(bench: Any) -> dict[str, str]:
