@@ -52,11 +52,20 @@ def report(tx: Session, mission_id: str) -> dict[str, Any]:
         "revision": known.revision,
         "seconds": None if ended is None or not mission.first_upload_at else ended - mission.first_upload_at,
         "stage_seconds": dict(sorted(mission.stage_seconds.items())),
+        "pixels": _pixels(mission),
         "delta": _deltas(rows),
         "latency_s": latency(frames.latencies_s(tx, mission_id)),
         "reprojection_rms_px": mission.reprojection_rms_px,
         **checked,
     }
+
+
+def _pixels(mission: Mission) -> Mapping[str, Any]:
+    """What drawing has cost: pixels rendered so far, by what for, and against one pass over all tiles."""
+    by_kind = dict(sorted(mission.pixels.items()))
+    rendered = sum(n for kind, n in by_kind.items() if kind != "sharpen")
+    ratio = round(rendered / mission.pass_pixels, 3) if mission.pass_pixels else None
+    return {"rendered": rendered, "one_pass": mission.pass_pixels, "ratio": ratio, "by_kind": by_kind}
 
 
 def _checkpoints(tx: Session, mission_id: str, rows: Sequence[Frame]) -> Mapping[str, Any]:

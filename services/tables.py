@@ -75,6 +75,16 @@ class Mission(Base):
         """The longest side, in pixels, at which photos are drawn; None: as they are."""
         return None if self.full else self.max_side
 
+    @property
+    def tile_side(self) -> int | None:
+        """The same for the tiles that are drawn now."""
+        return None if self.state == "sharpening" else self.drawn_side
+
+    @property
+    def tile_zoom(self) -> int | None:
+        """The zoom of the tiles that are drawn now."""
+        return self.zoom if self.sharp_zoom is None else self.sharp_zoom
+
 
 class Frame(Base):
     """One photo and how far it has come."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from core.coverage import FUSION, Encoded, block_grid, blocks, draw_block
+from core.coverage import FUSION, Encoded, block_grid, blocks, draw_block, tiles_under
 from core.fusion import FrameIndex
 from core.grid import TileKey
 from core.inputs import frame_digest, tile_inputs
 from core.patching import fill_block
 from services.catalog import backlog, missions, poses, tiles
 from services.catalog.backlog import ToDraw
-from services.catalog.poses import Poses
+from services.catalog.poses import Placed, Poses
 from services.catalog.tiles import Key, Render, TileBox
 from services.tables import Mission
 from workers import warmup
@@ -35,7 +35,7 @@ def fuse(mission_id: str, keys: Sequence[Sequence[int]]) -> None:
             if not wanted:
                 continue  # this task ran before, or somebody else was faster
             mission = missions.get(tx, mission_id)
-            known = poses.load(tx, mission_id, _box([TileKey(*key) for key in wanted]))
+            known = near(poses.load(tx, mission_id, _box(mission, list(wanted))), mission.tile_zoom)
         renders, pixels = drawn(mission, known, wanted)
         with db.write() as tx:
             tiles.record_renders(tx, mission_id, renders)
@@ -44,9 +44,24 @@ def fuse(mission_id: str, keys: Sequence[Sequence[int]]) -> None:
     go_on("publish", mission_id)
 
 
-def _box(block: Sequence[TileKey]) -> TileBox:
-    xs, ys = [t.x for t in block], [t.y for t in block]
-    return TileBox(block[0].z, min(xs), min(ys), max(xs), max(ys))
+def _box(mission: Mission, block: Sequence[Key]) -> TileBox:
+    """The tiles around the block among those by which poses are found."""
+    finer = max(0, block[0][0] - (mission.zoom or 0))
+    xs, ys = [x >> finer for _, x, _ in block], [y >> finer for _, _, y in block]
+    return TileBox(block[0][0] - finer, min(xs), min(ys), max(xs), max(ys))
+
+
+def near(known: Poses, zoom: int | None) -> Poses:
+    """The same poses, with the tiles of this zoom that they touch."""
+    if known.world is None or zoom is None or zoom == known.zoom:
+        return known
+    found: dict[str, Placed] = {}
+    for frame_id, placed in known.placed.items():
+        under = tiles_under(placed.posed(known.cameras), known.world, zoom)
+        xs, ys = [t.x for t in under], [t.y for t in under]
+        if under:
+            found[frame_id] = replace(placed, box=TileBox(zoom, min(xs), min(ys), max(xs), max(ys)))
+    return replace(known, zoom=zoom, placed=found)
 
 
 def drawn(
@@ -63,7 +78,7 @@ def drawn(
     parts = [tile for tile in block if not wanted[tile].whole]
     anew, redrawn = _redrawn(mission, known, whole, wanted)
     filled, added = _filled(mission, known, parts, wanted)
-    kind = "heal" if mission.final_generation is None else "final"
+    kind = "sharpen" if mission.sharp_zoom else "heal" if mission.final_generation is None else "final"
     return [*anew, *filled], {kind: redrawn, "new": added}
 
 
@@ -77,14 +92,14 @@ def _redrawn(
     done, inputs = [], dict[TileKey, str]()
     for tile in block:
         near = [digests[k] for k, p in known.placed.items() if _touches(p.box, tile)]
-        inputs[tile] = tile_inputs(tile, known.world, mission.drawn_side, near, FUSION)
+        inputs[tile] = tile_inputs(tile, known.world, mission.tile_side, near, FUSION)
         shown = wanted[tile].shown
         if shown is not None and shown.inputs == inputs[tile]:
             done.append(replace(shown, generation=wanted[tile].generation))
     left = [tile for tile in block if tile not in {TileKey(*r.key) for r in done}]
     if not left:
         return done, 0
-    photos = MissionPhotos(shelf, mission.id, mission.drawn_side)
+    photos = MissionPhotos(shelf, mission.id, mission.tile_side)
     found = draw_block(left, known.world, FrameIndex(frames, FUSION), photos)
     made = [put_tile(store, mission.id, wanted[t].generation, t, p, inputs[t]) for t, p in found.items()]
     grid = block_grid(left)
@@ -104,7 +119,7 @@ def _filled(
     assert known.world is not None
     shown = {tile: pictures.get(_key(wanted[tile].shown)) for tile in block}
     index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], FUSION)
-    photos = MissionPhotos(shelf, mission.id, mission.drawn_side)
+    photos = MissionPhotos(shelf, mission.id, mission.tile_side)
     patched = fill_block(shown, known.world, index, photos)
     return [_patch(mission.id, tile, wanted[tile], patched.changed) for tile in block], patched.pixels
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from core import errors
-from core.coverage import moved_px, outline_px, shows_all_of, tiles_under
+from core.coverage import mission_zoom, moved_px, outline_px, shows_all_of, tiles_under
 from core.geometry import Array, Pose, PosedFrame
 from core.grid import TileKey, ancestors
 from core.mosaic import MOST_TILES, Layout, waiting_frames
@@ -199,6 +199,15 @@ def everything(layout: Layout, published: Iterable[Key]) -> dict[Key, int]:
     cover = layout.cover
     led_to = cover | set(ancestors(cover))
     return dict.fromkeys(cover, NEW) | {k: NEW for k in published if TileKey(*k) not in led_to}
+
+
+def sharper(layout: Layout) -> Layout:
+    """The same frames on the tiles of the zoom that fits the full photos."""
+    zoom = mission_zoom(layout.frames.values(), layout.world, None)
+    if zoom is None:
+        return layout
+    under = {k: frozenset(tiles_under(f, layout.world, zoom)) for k, f in layout.frames.items()}
+    return replace(layout, zoom=zoom, under=under)
 
 
 def update_of(layout: Layout, keys: Mapping[str, str], new_ids: Collection[str] | None = None) -> PoseUpdate:

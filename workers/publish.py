@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 from core.coverage import overview, quarter, top_zoom
-from core.grid import TileKey, children, parent
-from services.catalog import backlog, missions, tiles
+from core.grid import TileKey, ancestors, children, parent
+from services.catalog import backlog, missions, sharpening, tiles
 from services.catalog.tiles import Key, Render, TileBox
 from services.errors import RevisionConflict
 from services.queue import send
+from services.tables import Mission
 from workers.app import CLAIM_TTL_S, Stopwatch, db, log, settings, stage, store
 from workers.pictures import Pictures, put_tile
 
@@ -30,13 +31,16 @@ def publish(mission_id: str) -> None:
             pending = tiles.pending_renders(tx, mission_id)
             bounds = tiles.bounds(tx, mission_id)
             desk = backlog.of(tx, mission_id, CLAIM_TTL_S)
+            awaited = sharpening.awaited(tx, mission_id) if mission.sharp_zoom is not None else set()
         if not pending or mission.zoom is None:
             break
-        final = mission.final_generation is not None
+        sharpens = mission.sharp_zoom is not None
+        final = mission.final_generation is not None and not sharpens
         more = desk.in_flight + (desk.to_render if final else 0) > 0
         if more and len(pending) < (ENOUGH if final else ENOUGH_LIVE):
             break  # whoever draws the last of them wakes us
-        changes = _with_overviews(mission_id, mission.zoom, pending, bounds)
+        left = awaited - {render.key for render in pending}
+        changes = _with_overviews(mission, pending, bounds, left)
         try:
             with db.write() as tx:
                 revision = tiles.publish(tx, mission_id, mission.revision, changes, pending)
@@ -48,19 +52,26 @@ def publish(mission_id: str) -> None:
 
 
 def _with_overviews(
-    mission_id: str, zoom: int, pending: Sequence[Render], bounds: TileBox | None
+    mission: Mission, pending: Sequence[Render], bounds: TileBox | None, awaited: Collection[Key]
 ) -> list[Render]:
-    """The renders and everything above them, deepest first."""
+    """The renders and everything above them, deepest first.
+
+    While the map is sharpened, a tile from the preview's zoom on waits for all the sharper ones below it
+    (`awaited` are still to come): until then it shows what it did.
+    """
+    assert mission.tile_zoom is not None
+    zoom = mission.tile_zoom
     by_level: dict[int, dict[TileKey, Render]] = {}
     for render in pending:
         by_level.setdefault(render.key[0], {})[TileKey(*render.key)] = render
-    top = _top(mission_id, zoom, by_level.get(zoom, {}), bounds)
+    top = _top(mission, by_level.get(zoom, {}), bounds, bool(awaited))
+    held = set(ancestors([TileKey(*key) for key in awaited], mission.zoom or 0))
     newest = max(r.generation for r in pending)
     changes = [r for z, level in by_level.items() if z >= zoom for r in level.values()]
     below = by_level.get(zoom, {})
     for z in range(zoom - 1, -1, -1):
         stale = {parent(tile) for tile in below} | by_level.get(z, {}).keys()
-        below = _overviews(mission_id, sorted(stale), below, newest, z >= top)
+        below = _overviews(mission.id, sorted(stale - held), below, newest, z >= top)
         changes += below.values()
     return changes
 
@@ -96,14 +107,18 @@ def _overviews(
     }
 
 
-def _top(mission_id: str, zoom: int, renders: Mapping[TileKey, Render], bounds: TileBox | None) -> int:
-    """The uppermost zoom of the pyramid once these native tiles are shown."""
+def _top(mission: Mission, renders: Mapping[TileKey, Render], bounds: TileBox | None, partly: bool) -> int:
+    """The uppermost zoom of the pyramid once these native tiles are shown. `partly`: others are to come."""
+    assert mission.tile_zoom is not None
+    zoom = mission.tile_zoom
     filled = {tile for tile, r in renders.items() if r.object_key is not None}
-    if len(filled) < len(renders):
+    sharpened = mission.sharp_zoom is not None and not partly
+    if sharpened or (len(filled) < len(renders) and not partly):
         # Something became empty: only all tiles together tell how far the map still reaches.
         with db.read() as tx:
-            shown = {TileKey(*key) for key in tiles.keys(tx, mission_id, zoom)}
+            shown = {TileKey(*key) for key in tiles.keys(tx, mission.id, zoom)}
         filled |= shown - renders.keys()
     elif bounds is not None:
-        filled |= {TileKey(zoom, bounds.x0, bounds.y0), TileKey(zoom, bounds.x1, bounds.y1)}
+        corners = {TileKey(bounds.z, bounds.x0, bounds.y0), TileKey(bounds.z, bounds.x1, bounds.y1)}
+        filled = corners if partly else filled | corners
     return top_zoom(filled) if filled else zoom

@@ -14,7 +14,7 @@ from core.pose_graph import GraphFrame, Solution, place
 from core.scale import KnownScale
 from core.submaps import SubmapGraph, joins
 from core.ties import Canonical, canonical
-from services.catalog import backlog, frames, missions, pairs, poses, surveys, tiles
+from services.catalog import backlog, frames, missions, pairs, poses, sharpening, surveys, tiles
 from services.catalog.backlog import Backlog
 from services.catalog.pairs import Key as PairKey
 from services.catalog.poses import PoseUpdate
@@ -25,14 +25,16 @@ from workers import surveyed, tying, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
 from workers.lease import held
 from workers.photos import Pixels, shelf
-from workers.posing import Known, changed, everything, joined, update_of
+from workers.posing import Known, changed, everything, joined, sharper, update_of
 from workers.tying import sighting
 
 GROWTH = 2.0
 """All poses are solved again when the mission, or its frames with GPS, grew so many times since the last."""
 MERGE_GROWTH = 1.02
 """When maps that were apart are tied, so much is enough, or a moment in which there is nothing else to do."""
-LIVE_SHARE = 0.95
+SPARE = 6
+"""The priority of what only spare workers do: after all that any mission waits for."""
+LIVE_SHARE = 0.85
 """What may be rendered before the final pass, as a share of that pass."""
 FEW = 8
 ASK_AGAIN_S = 10.0
@@ -109,6 +111,8 @@ def _step(mission_id: str, epoch: int) -> bool:
         mission = missions.get(tx, mission_id)
         desk = backlog.of(tx, mission_id, CLAIM_TTL_S)
         new = frames.list(tx, mission_id, "matched", limit=10_000) if desk.matched else []
+    if mission.state == "sharpening" and (mission.sharp_zoom is None or desk == IDLE):
+        return _sharpen(mission, epoch)
     if mission.state == "finalising" and not desk.unread and (new or mission.final_generation is None):
         return _solve_finally(mission, epoch)
     if new and (mission.state != "finalising" or desk.unread >= WORTH_A_LOOK):
@@ -126,6 +130,24 @@ def _step(mission_id: str, epoch: int) -> bool:
     if mission.state == "finalising" and not (desk.unread or desk.in_flight or desk.to_publish):
         with db.write() as tx:
             missions.finish(tx, mission_id, epoch)
+            return missions.get(tx, mission_id).state == "sharpening"
+    return False
+
+
+def _sharpen(mission: Mission, epoch: int) -> bool:
+    """Begin to draw the map from the full photos, or, when that is done, end it."""
+    known = _recall(mission)
+    assert known.layout is not None
+    sharp = sharper(known.layout)
+    assert sharp.zoom is not None
+    with db.write() as tx:
+        if mission.sharp_zoom is None:
+            keys = everything(sharp, [k for k in tiles.keys(tx, mission.id) if k[0] >= (mission.zoom or 0)])
+            sharpening.begin(tx, mission.id, epoch, sharp.zoom, list(keys))
+            return True
+        if sharpening.end(tx, mission.id):
+            update = replace(update_of(sharp, known.camera_keys), final=True)
+            known.generation, known.layout = poses.save(tx, mission.id, epoch, update), sharp
     return False
 
 
@@ -219,7 +241,6 @@ def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, 
     """All that were ever read: what came since may tie in a frame that had no place before."""
     before = known.layout
     found, graph = _solve_all(mission, known)
-    found = surveyed.held(found, known.seen, surveyed.points_of(mission.id))
     zoom_now = before.zoom if before is not None else None
     thumb = _thumb(mission.id)
     after = lay_out(found, known.camera_keys, thumb, mission.drawn_side, zoom_now, mission.mode)
@@ -261,7 +282,8 @@ def _rests(mission: Mission) -> bool:
 def _solve_all(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:
     matches = _matches(mission.id, None) if mission.mode == "visual" else []
     scale = KnownScale.from_json(mission.scale)
-    return solved([known.seen[k] for k in sorted(known.seen)], Canonical((), (), tuple(matches)), scale)
+    seen, points = [known.seen[k] for k in sorted(known.seen)], surveyed.points_of(mission.id)
+    return solved(seen, Canonical((), (), tuple(matches)), scale, points)
 
 
 def _matches(mission_id: str, touching: set[str] | None) -> list[PairMatch]:
@@ -292,8 +314,7 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
     if pairs_of_all is None:
         return False
     points = surveyed.points_of(mission.id)
-    found, submaps = solved(list(graph.values()), pairs_of_all, KnownScale.from_json(mission.scale))
-    found = surveyed.held(found, graph, points)
+    found, submaps = solved(list(graph.values()), pairs_of_all, KnownScale.from_json(mission.scale), points)
     keys = {k: f.meta.camera_key for k, f in graph.items()}
     layout = lay_out(found, keys, _thumb(mission.id), mission.drawn_side, mode=mission.mode)
     update = replace(
@@ -354,8 +375,8 @@ def _all_matched(mission_id: str, wanted: set[PairKey]) -> bool:
 def _dispatch(mission: Mission, desk: Backlog) -> bool:
     """Hand out tiles, as many at a time as there are workers; one task while photos still wait to be read."""
     busy = desk.unread > settings.workers
-    final = mission.final_generation is not None
-    size = FINAL_TILES if final else LIVE_TILES
+    sharpens, final = mission.state == "sharpening", mission.final_generation is not None
+    size = LIVE_TILES if sharpens or not final else FINAL_TILES
     room = size * (1 if busy else settings.workers) - desk.in_flight
     now = time.monotonic()
     if room <= 0 or (busy and now < _rested.get(mission.id, 0.0)):
@@ -367,5 +388,5 @@ def _dispatch(mission: Mission, desk: Backlog) -> bool:
     if not busy:  # few tiles are shared out evenly, so that they are there soon
         size = min(size, max(4, -(-len(keys) // settings.workers)))
     for start in range(0, len(keys), size):
-        send("fuse", mission.id, keys[start : start + size])
+        send("fuse", mission.id, keys[start : start + size], priority=SPARE if sharpens else None)
     return False

@@ -13,7 +13,7 @@ from services.report import latency
 from services.tables import Export, Frame, Mission
 
 FrameState = Literal["received", "ready", "matched", "posed", "fused", "waiting", "rejected"]
-MissionState = Literal["open", "finalising", "final", "deleting"]
+MissionState = Literal["open", "finalising", "sharpening", "final", "deleting"]
 ExportState = Literal["available", "wanted", "ready", "failed"]
 Mode = Literal["visual", "gnss"]
 
@@ -62,6 +62,9 @@ class MissionIn(BaseModel):
     max_side: Annotated[int, Field(ge=256, le=65535)] | None = Field(
         None, description="Longest side, in pixels, at which photos are drawn; null: as they are"
     )
+    backfill: bool = Field(
+        False, description="Draw the map from the full photos, tile by tile, once it is final at `max_side`"
+    )
     scale: ScaleIn | None = Field(None, description="For photos without GPS; it can be given later as well")
 
 
@@ -91,16 +94,22 @@ class ProgressOut(BaseModel):
     first_upload_at: float | None
     last_tile_at: float | None
     finished_at: float | None
+    sharpened: float | None = Field(
+        description="How much of the map is drawn at full resolution, 0 to 1, while that is done"
+    )
     event_seq: int
 
 
 class MissionOut(BaseModel):
-    """A mission. `zoom`: of its native 512 px tiles, null until the first photo is placed."""
+    """A mission. `zoom`: of its finest 512 px tiles, null until the first photo is placed. `backfill`: it is
+    drawn from the full photos once it is final.
+    """
 
     id: str
     name: str
     mode: Mode
     max_side: int | None
+    backfill: bool
     state: MissionState
     created_at: float
     zoom: int | None
@@ -197,6 +206,7 @@ def progress_document(tx: Session, mission_id: str) -> ProgressOut:
         first_upload_at=known.first_upload_at,
         last_tile_at=known.last_tile_at,
         finished_at=known.finished_at,
+        sharpened=known.sharpened,
         event_seq=known.event_seq,
     )
 
@@ -208,9 +218,10 @@ def mission_document(tx: Session, row: Mission, public_url: str) -> MissionOut:
         name=row.name,
         mode=cast(Mode, row.mode),
         max_side=row.max_side,
+        backfill=row.backfill,
         state=cast(MissionState, row.state),
         created_at=row.created_at,
-        zoom=row.zoom,
+        zoom=row.tile_zoom,
         scale=None if row.scale is None else ScaleIn.model_validate(row.scale),
         georeferenced=poses.georeferenced(tx, row.id),
         event_seq=row.event_seq,

@@ -70,6 +70,12 @@ class RevisionGone(NotFound):
     code = "revision_not_found"
 
 
+class NotDrawnYet(NotFound):
+    """The tile is still to be drawn at this zoom; the ones above it show the place already."""
+
+    code = "not_drawn_yet"
+
+
 class AllRefused(OrthostreamError):
     """No photo of the request was accepted; `errors` says why for each."""
 

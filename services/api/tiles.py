@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 
 from services.api.context import MissionId, PublicUrl, Services, Use
-from services.api.problems import RevisionGone
+from services.api.problems import NotDrawnYet, RevisionGone
 from services.catalog import missions, tiles
 from services.catalog.tiles import StoredTile, TileBox
 from services.errors import ObjectNotFound
@@ -41,8 +41,9 @@ def get_tile(
     for _ in range(2):
         with services.db.read() as tx:
             tile = tiles.get(tx, mission_id, z, x, y)
-            if tile is None:
-                missions.get(tx, mission_id)
+            row = missions.get(tx, mission_id) if tile is None else None
+            if row is not None and row.zoom is not None and row.zoom < z <= (row.sharp_zoom or 0):
+                raise NotDrawnYet()  # viewers show the tile above instead
         try:
             return _answer(services, tile, request, _NOW)
         except ObjectNotFound:
@@ -80,7 +81,7 @@ def get_tilejson(mission_id: MissionId, services: Use, public_url: PublicUrl) ->
         "tiles": [f"{public_url}/api/v1/missions/{row.id}/tiles/{{z}}/{{x}}/{{y}}"],
         "tileSize": 512,
         "minzoom": 0,
-        "maxzoom": row.zoom if row.zoom is not None else 0,
+        "maxzoom": row.tile_zoom or 0,
     }
     if box:
         west, south, east, north = _bounds_deg(box)

@@ -15,7 +15,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from core.errors import OrthostreamError
 from core.frame import FrameMeta
-from services.catalog import events
+from services.catalog import events, sharpening
 from services.catalog.rows import chunks, clock, insert, lock
 from services.catalog.wakes import Wake
 from services.errors import FrameNotFound
@@ -348,7 +348,8 @@ def _insert(tx: Session, **values: Any) -> bool:
 def _reopen(tx: Session, mission: Mission, now: float) -> None:
     mission.first_upload_at = mission.first_upload_at or now
     mission.final_generation = None  # what was solved as final lacks this frame
-    if mission.state == "final":
+    if mission.state in ("final", "sharpening"):
+        sharpening.undo(tx, mission, now)
         mission.state = "open"
         mission.finished_at = None
         events.append(tx, mission.id, "mission", {"state": "open"}, now)

@@ -1,4 +1,4 @@
-"""Missions: open → finalising → final, and open again when another photo comes; deleting at last."""
+"""Missions: open → finalising (→ sharpening) → final, and open again when another photo comes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from sqlalchemy import delete as delete_rows
 from sqlalchemy.orm import Session
 
 from core.scale import UNKNOWN, KnownScale
-from services.catalog import events, frames, leases, tiles
+from services.catalog import events, frames, leases, sharpening, tiles
 from services.catalog.rows import clock, lock, mission
 from services.catalog.wakes import Wake
 from services.tables import DirtyTile, Frame, Mission, Tile
 
 _ALPHABET = "abcdefghijkmnpqrstuvwxyz23456789"  # no l, o, 0, 1: ids are read out over the radio
 _RATE_WINDOW_S = 30.0
-_UNDER_WAY = ("open", "finalising")
+_ENDING = ("finalising", "sharpening")
+_UNDER_WAY = ("open", *_ENDING)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +27,8 @@ class Progress:
     """How far a mission has come.
 
     `counts`: frames by state, every state named. `tiles`: those that show something, overviews included.
-    `dirty`: native tiles still to be shown anew. `fused_per_s`: over the last half minute.
+    `dirty`: native tiles still to be shown anew. `fused_per_s`: over the last half minute. `sharpened`: how
+    much is drawn at full resolution, 0 … 1, while that is done.
     """
 
     mission_id: str
@@ -42,6 +44,7 @@ class Progress:
     first_upload_at: float | None
     last_tile_at: float | None
     finished_at: float | None
+    sharpened: float | None = None
 
     @property
     def idle(self) -> bool:
@@ -57,8 +60,11 @@ def create(
     max_side: int | None = None,
     now: float | None = None,
     scale: KnownScale = UNKNOWN,
+    backfill: bool = False,
 ) -> Mission:
-    """A new, empty mission. `mode`: visual or gnss; `max_side`: px to work on; None: all."""
+    """A new, empty mission. `mode`: visual or gnss; `max_side`: px to work on; None: all; `backfill`: draw it
+    from the full photos once it is final.
+    """
     row = Mission(
         id="".join(secrets.choice(_ALPHABET) for _ in range(10)),
         name=name.replace("\x00", ""),
@@ -70,6 +76,8 @@ def create(
         stage_seconds={},
         scale=scale.to_json(),
         pixels={},
+        backfill=backfill,
+        full=False,
     )
     tx.add(row)
     tx.flush()
@@ -97,7 +105,7 @@ def active(tx: Session) -> Sequence[Mission]:
 
 
 def request_finalise(tx: Session, mission_id: str, now: float | None = None) -> Mission:
-    """Open → finalising; a mission that is finalising or final stays so."""
+    """Open → finalising; a mission that is further stays so."""
     row = lock(tx, mission_id)
     now = clock(now)
     if row.state == "open":
@@ -107,9 +115,10 @@ def request_finalise(tx: Session, mission_id: str, now: float | None = None) -> 
 
 
 def finish(tx: Session, mission_id: str, epoch: int, now: float | None = None) -> bool:
-    """Finalising → final. False while a frame or tile is on its way, or a photo came after the final solve.
+    """Finalising → final, or sharpening.
 
-    Raises LeaseLost unless `epoch` is the present owner's.
+    False while a frame or tile is on its way, or a photo came after the final solve. Raises LeaseLost unless
+    `epoch` is the present owner's.
     """
     leases.guard(tx, mission_id, epoch)
     row = lock(tx, mission_id)
@@ -122,8 +131,11 @@ def finish(tx: Session, mission_id: str, epoch: int, now: float | None = None) -
         select(Mission.id).where(Mission.id == mission_id, _has_unfinished())
     ):
         return False
-    row.state, row.finished_at = "final", now
-    events.append(tx, mission_id, "mission", {"state": "final", "revision": row.revision}, now)
+    if sharpening.wanted(row):
+        row.state = "sharpening"
+    else:
+        row.state, row.finished_at = "final", now
+    events.append(tx, mission_id, "mission", {"state": row.state, "revision": row.revision}, now)
     return True
 
 
@@ -146,7 +158,8 @@ def reopen_if_solved(tx: Session, row: Mission, now: float) -> bool:
     if not tx.scalar(select(posed)):
         return False
     row.final_generation = None
-    if row.state == "final":
+    if row.state in ("final", "sharpening"):
+        sharpening.undo(tx, row, now)
         row.state, row.finished_at = "open", None
         events.append(tx, row.id, "mission", {"state": "open"}, now)
     return True
@@ -207,6 +220,7 @@ def progress(tx: Session, mission_id: str, now: float | None = None) -> Progress
         first_upload_at=row.first_upload_at,
         last_tile_at=row.last_tile_at,
         finished_at=row.finished_at,
+        sharpened=sharpening.share(tx, row),
     )
 
 
@@ -217,7 +231,7 @@ def stalled(tx: Session, older_than_s: float, now: float | None = None) -> Seque
     query = (
         select(Mission, rendered)
         .where(Mission.state.in_(_UNDER_WAY), func.coalesce(Mission.woken_at, 0.0) < now - older_than_s)
-        .where((Mission.state == "finalising") | _has_tiles_to_show() | _is_behind())
+        .where(Mission.state.in_(_ENDING) | _has_tiles_to_show() | _is_behind())
         .order_by(Mission.id)
         .with_for_update(of=Mission, skip_locked=True)
         .execution_options(populate_existing=True)
@@ -246,4 +260,4 @@ def _has_unfinished() -> ColumnElement[bool]:
 
 
 def _has_work() -> ColumnElement[bool]:
-    return (Mission.state == "finalising") | _has_unfinished()
+    return Mission.state.in_(_ENDING) | _has_unfinished()

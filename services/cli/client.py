@@ -82,10 +82,15 @@ class Client:
             raise Refused(f"What answers at {self.url} is not orthostream. Is the address right?")
 
     def create(
-        self, name: str, mode: str, max_side: int | None, scale: Mapping[str, Any] | None = None
+        self,
+        name: str,
+        mode: str,
+        max_side: int | None,
+        scale: Mapping[str, Any] | None = None,
+        backfill: bool = False,
     ) -> str:
         """A new mission's id. `scale`: as the API knows it."""
-        body = {"name": name, "mode": mode, "max_side": max_side, "scale": scale}
+        body = {"name": name, "mode": mode, "max_side": max_side, "scale": scale, "backfill": backfill}
         return str(self._json("POST", "/missions", json=body)["id"])
 
     def scale(self, mission_id: str, scale: Mapping[str, Any] | None) -> None:

@@ -52,6 +52,9 @@ def run(
         int | None,
         typer.Option(min=256, max=65535, help="Longest side in pixels to work on; all unless set."),
     ] = None,
+    full_after: Annotated[
+        bool, typer.Option("--full-after", help="Once the map is final at --max-side, draw it in full.")
+    ] = False,
     first_height: FirstHeight = None,
     marker: MarkerText = None,
     crs: Annotated[
@@ -68,6 +71,8 @@ def run(
     """Map a folder of photos. Run again, it continues where it stopped."""
     if mode not in ("visual", "gnss"):
         raise typer.BadParameter("it is visual or gnss", param_hint="--mode")
+    if full_after and max_side is None:
+        raise typer.BadParameter("it needs --max-side", param_hint="--full-after")
     if crs:
         mosaic_in(crs)  # a wrong one shall not show after an hour's work
     console = Console(stderr=False)
@@ -80,7 +85,7 @@ def run(
         client = Client(url, say=lambda line: console.print(line, style="yellow", markup=False))
         try:
             client.greet()
-            mission_id = _mission(client, out / HOME, photos, mode, max_side, scale)
+            mission_id = _mission(client, out / HOME, photos, mode, (max_side, full_after), scale)
             send_survey(client, mission_id, survey)
             tally = map_photos(client, mission_id, found, out, console, 1 / pace if pace else 0.0, crs)
             summary(out, console, f"{client.url}/missions/{mission_id}" if keep or server else None, tally)
@@ -136,11 +141,21 @@ def _service(server: str | None, home: Path, console: Console) -> Iterator[str]:
 
 
 def _mission(
-    client: Client, home: Path, photos: Path, mode: str, max_side: int | None, scale: KnownScale
+    client: Client,
+    home: Path,
+    photos: Path,
+    mode: str,
+    side: tuple[int | None, bool],
+    scale: KnownScale,
 ) -> str:
-    """The mission of the run before, if it was about the same photos, else a new one."""
+    """The mission of the run before, if it was about the same photos, else a new one.
+
+    `side`: of the photos as they are drawn, and whether the map is drawn in full afterwards.
+    """
     path = home / "mission.json"
+    max_side, backfill = side
     wanted: dict[str, Any] = {"photos": str(photos.resolve()), "mode": mode, "max_side": max_side}
+    wanted |= {"backfill": True} if backfill else {}
     try:
         before = json.loads(path.read_text())
     except (OSError, ValueError):
@@ -151,7 +166,7 @@ def _mission(
     folder = photos.resolve()
     name = folder.parent.name if folder.name in ("images", "photos") else folder.name
     shown = os.fsencode(name).decode("utf-8", "replace")[:_NAME_CHARS]
-    mission_id = client.create(shown or "Mission", mode, max_side, scale.to_json())
+    mission_id = client.create(shown or "Mission", mode, max_side, scale.to_json(), backfill)
     home.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(wanted | {"mission": mission_id}))
     return mission_id

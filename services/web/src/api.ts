@@ -1,7 +1,7 @@
 /** The HTTP API as the page sees it: types of its documents and one typed fetch. */
 
 export type FrameState = "received" | "ready" | "matched" | "posed" | "fused" | "waiting" | "rejected";
-export type MissionState = "open" | "finalising" | "final" | "deleting";
+export type MissionState = "open" | "finalising" | "sharpening" | "final" | "deleting";
 export type Source = "visual" | "gnss" | "vision-only";
 export type Counts = Record<FrameState, number>;
 
@@ -16,6 +16,7 @@ export interface Progress {
   rate_per_s: number | null;
   latency_s: { p50: number; p95: number } | null;
   reprojection_rms_px: number | null;
+  sharpened: number | null;
 }
 
 export interface Scale {

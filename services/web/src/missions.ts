@@ -7,8 +7,8 @@ import { reached } from "./panel";
 import { dropTarget } from "./uploads";
 
 const REFRESH_MS = 4000;
-const LABEL = { open: "Live", finalising: "Finalising", final: "Final", deleting: "Being deleted" } as const;
-const TONE = { open: "live", finalising: "busy", final: "done", deleting: "off" } as const;
+const LABEL = { open: "Live", finalising: "Finalising", sharpening: "Sharpening", final: "Final", deleting: "Being deleted" } as const;
+const TONE = { open: "live", finalising: "busy", sharpening: "busy", final: "done", deleting: "off" } as const;
 
 export type OpenMission = (id: string, photos: File[]) => void;
 

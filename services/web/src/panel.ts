@@ -9,6 +9,7 @@ import { SubmapsSection } from "./submaps";
 const STATE: Record<MissionState, [label: string, tone: string]> = {
   open: ["Live", "live"],
   finalising: ["Finalising", "busy"],
+  sharpening: ["Sharpening", "busy"],
   final: ["Final", "done"],
   deleting: ["Being deleted", "off"],
 };
@@ -211,12 +212,13 @@ export class Panel {
     text(this.figures.revision.value, revision ? String(revision) : "–");
   }
 
-  private setFinalise({ state }: Progress, good: number): void {
+  private setFinalise({ state, sharpened }: Progress, good: number): void {
     this.finalise.disabled = state !== "open" || good === 0;
-    this.finalise.hidden = state === "final";
+    this.finalise.hidden = state === "final" || state === "sharpening";
     text(this.finaliseHint, {
       open: good ? "Finalising solves all photos together and draws the best map they give. More can still follow." : "",
       finalising: "Solving all photos together and drawing the final map…",
+      sharpening: `This map is final and is being drawn at full resolution: ${Math.floor(100 * (sharpened ?? 0))}% so far.`,
       final: "This map is final. Adding photos opens it again.",
       deleting: "This mission is being deleted.",
     }[state]);
