@@ -32,6 +32,7 @@ class Known:
     `solved_located`: frames with GPS in the last solve. `untried`: frames that have not looked for ties with
     other maps yet; `tries`: pairs that were asked for in order to tie maps and are still being matched.
     `tied`: maps were found to hang together since the last solve; `scale`: what that had for it.
+    `looked_at`, `with_fix`: what `located` goes by.
     """
 
     generation: int
@@ -44,13 +45,15 @@ class Known:
     tries: set[PairKey] = field(default_factory=set)
     tied: bool = False
     scale: Mapping[str, Any] | None = None
+    looked_at: set[str] = field(default_factory=set)
+    with_fix: set[str] = field(default_factory=set)
 
     @classmethod
     def read(cls, poses: Poses, sightings: Iterable[Seen], rms_px: float | None) -> Known:
         """From the rows alone, as another sequencer left them."""
         seen = {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in sightings}
         known = cls(poses.generation, _layout(poses), poses.solved_frames, rms_px or 0.0, seen)
-        known.solved_located = known.located(poses.placed)
+        known.solved_located = len(known.located & poses.placed.keys())
         return known
 
     @property
@@ -79,9 +82,14 @@ class Known:
         poses = {k: f.pose for k, f in self.layout.frames.items()} | dict(self.layout.waiting)
         return {k: k if p is None or p.source == "gnss" else p.submap for k, p in poses.items()}
 
-    def located(self, frame_ids: Iterable[str]) -> int:
-        """How many of these frames have GPS."""
-        return sum(usable_fix(self.seen[k].meta.gps) is not None for k in frame_ids if k in self.seen)
+    @property
+    def located(self) -> set[str]:
+        """The frames that have GPS."""
+        for k in self.seen.keys() - self.looked_at:
+            self.looked_at.add(k)
+            if usable_fix(self.seen[k].meta.gps) is not None:
+                self.with_fix.add(k)
+        return self.with_fix
 
     @property
     def camera_keys(self) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from core.coverage import pass_pixels
@@ -218,21 +218,25 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
 def _due(known: Known, new_ids: set[str], matches: Sequence[PairMatch]) -> bool:
     """Whether all is to be solved again instead of placing what is new."""
     homes = known.homes
-    total, located = len(homes.keys() | new_ids), known.located(homes.keys() | new_ids)
+    everyone = homes.keys() | new_ids
+    total, located = len(everyone), len(known.located & everyone)
     grown = total < FEW or total >= GROWTH * known.solved_frames
     # Its first fixes place a map badly that was flown without GPS: twice as many place it better.
     if grown or (located > 0 and located >= GROWTH * known.solved_located):
         return True
     maps = {k: home for k, home in homes.items() if home != k or k in known.waiting}
-    known.tied |= joins(maps, new_ids, matches) or _lifts(known, new_ids, matches)
+    known.tied |= joins(maps, new_ids, matches) or _lifts(known, homes, new_ids, matches)
     return known.tied and total >= MERGE_GROWTH * known.solved_frames
 
 
-def _lifts(known: Known, new_ids: set[str], matches: Sequence[PairMatch]) -> bool:
+def _lifts(
+    known: Known, homes: Mapping[str, int | str], new_ids: set[str], matches: Sequence[PairMatch]
+) -> bool:
     """Whether new frames tie what has no place to a frame that GPS alone has placed so far."""
-    alone = new_ids | {k for k, home in known.homes.items() if home == k}
-    stuck = {k for k in (*known.waiting, *new_ids) if not known.located([k])}
-    fixed = {k for k in alone if known.located([k])}
+    stuck = (known.waiting.keys() | new_ids) - known.located
+    if not stuck:
+        return False
+    fixed = (new_ids | {k for k, home in homes.items() if home == k}) & known.located
     ends = [(m.low, m.high) for m in matches if m.accepted and new_ids & {m.low, m.high}]
     return any((a in stuck and b in fixed) or (b in stuck and a in fixed) for a, b in ends)
 
@@ -257,7 +261,7 @@ def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, 
     )
     known.solved_frames, known.reprojection_rms_px, known.tied = total, rms_px, False
     known.scale = mission.scale
-    known.solved_located = known.located(known.seen)
+    known.solved_located = len(known.located)
     return after, dirty, update
 
 
@@ -334,7 +338,7 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
         generation = poses.save(tx, mission.id, epoch, update)
         clock.spend(tx, mission.id, "solve")
     known = Known(generation, layout, len(graph), found.reprojection_rms_px, graph)
-    known.solved_located, known.scale = known.located(graph), mission.scale
+    known.solved_located, known.scale = len(known.located), mission.scale
     _known[mission.id] = known
     _expected.pop(mission.id, None)
     log.info("solved finally", mission=mission.id, frames=len(graph), posed=len(layout.frames))
