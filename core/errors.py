@@ -60,6 +60,12 @@ class TooFewPixels(RejectedFrame):
     code = "too_few_pixels"
 
 
+class PhotoLost(RejectedFrame):
+    """The photo's file is gone from the storage. Upload it again."""
+
+    code = "photo_lost"
+
+
 class FarFromMission(RejectedFrame):
     """The photo's GPS lies far away from the rest of the mission. Put it into a mission of its own."""
 

@@ -14,10 +14,11 @@ from services.catalog import backlog, missions, poses, tiles
 from services.catalog.backlog import ToDraw
 from services.catalog.poses import Placed, Poses
 from services.catalog.tiles import Key, Render, TileBox
+from services.queue import send
 from services.tables import Mission
 from workers import warmup
-from workers.app import Stopwatch, before_the_fork, db, go_on, settings, stage, store
-from workers.photos import MissionPhotos, shelf
+from workers.app import Stopwatch, before_the_fork, db, go_on, log, settings, stage, store
+from workers.photos import FileGone, MissionPhotos, shelf
 from workers.pictures import Pictures, put_tile
 
 before_the_fork(warmup.rendering)
@@ -30,18 +31,29 @@ def fuse(mission_id: str, keys: Sequence[Sequence[int]]) -> None:
     """Render these tiles from the newest poses and hand them to publish."""
     clock = Stopwatch()
     for claimed in blocks(TileKey(*key) for key in keys):
-        with db.read() as tx:
-            wanted = backlog.unrendered(tx, mission_id, claimed)
-            if not wanted:
-                continue  # this task ran before, or somebody else was faster
-            mission = missions.get(tx, mission_id)
-            known = near(poses.load(tx, mission_id, _box(mission, list(wanted))), mission.tile_zoom)
-        renders, pixels = drawn(mission, known, wanted)
-        with db.write() as tx:
-            tiles.record_renders(tx, mission_id, renders)
-            missions.count_pixels(tx, mission_id, pixels)
-            clock.spend(tx, mission_id, "fuse")
+        try:
+            _fuse_block(mission_id, claimed, clock)
+        except FileGone as gone:
+            log.warning("photo lost", mission=mission_id, frame=gone.frame_id)
+            with db.write() as tx:
+                poses.lose(tx, mission_id, gone.frame_id)
+            send("fuse", mission_id, claimed)
+            send("sequence", mission_id)
     go_on("publish", mission_id)
+
+
+def _fuse_block(mission_id: str, claimed: Sequence[TileKey], clock: Stopwatch) -> None:
+    with db.read() as tx:
+        wanted = backlog.unrendered(tx, mission_id, claimed)
+        if not wanted:
+            return  # this task ran before, or somebody else was faster
+        mission = missions.get(tx, mission_id)
+        known = near(poses.load(tx, mission_id, _box(mission, list(wanted))), mission.tile_zoom)
+    renders, pixels = drawn(mission, known, wanted)
+    with db.write() as tx:
+        tiles.record_renders(tx, mission_id, renders)
+        missions.count_pixels(tx, mission_id, pixels)
+        clock.spend(tx, mission_id, "fuse")
 
 
 def _box(mission: Mission, block: Sequence[Key]) -> TileBox:

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from core.decode import decode_rgb
-from core.errors import RejectedFrame
+from core.errors import PhotoLost, RejectedFrame
 from core.features import FEATURE_SIDE_PX, Features, extract
 from core.frame import FrameMeta
 from core.metadata import read_metadata
 from core.photo import probe
 from services.catalog import frames
-from services.errors import OutOfDisk
+from services.errors import ObjectNotFound, OutOfDisk
 from services.queue import send
 from services.tables import Frame
 from workers.app import MAX_ATTEMPTS, Stopwatch, db, go_on, log, settings, stage, store
@@ -37,8 +37,12 @@ def ingest(mission_id: str, frame_id: str) -> None:
         if attempts > MAX_ATTEMPTS:
             _put_off(mission_id, frame_id, attempts, Unreadable())
             return
-        with _uncounted(mission_id, frame_id):
-            data = store.get(photo_key(mission_id, frame_id))
+        try:
+            with _uncounted(mission_id, frame_id):
+                data = store.get(photo_key(mission_id, frame_id))
+        except ObjectNotFound:
+            _put_off(mission_id, frame_id, attempts, PhotoLost())
+            return
         try:
             meta, features = read(data, frame)
         except Exception as error:

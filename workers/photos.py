@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.decode import decode_rgb
+from core.errors import PhotoLost
 from core.features import Features
+from services.errors import ObjectNotFound
 from services.storage import ObjectStore
 from workers.app import settings, store
 
@@ -35,6 +37,11 @@ class BytesLru:
         """Starts empty."""
         self._limit_bytes = limit_bytes
         self._held: OrderedDict[Hashable, tuple[Any, int]] = OrderedDict()
+        self.held_bytes = 0
+
+    def clear(self) -> None:
+        """Forgets all: it can be made again."""
+        self._held.clear()
         self.held_bytes = 0
 
     def get(self, key: Hashable, make: Callable[[], tuple[Any, int]]) -> Any:
@@ -115,6 +122,15 @@ shelf = PhotoShelf.of(store, settings.photo_cache_bytes)
 """The one shelf of this process."""
 
 
+class FileGone(PhotoLost):
+    """A photo's file is gone from the storage."""
+
+    def __init__(self, frame_id: str) -> None:
+        """Whose."""
+        super().__init__(f"The file of photo {frame_id} is gone from the storage. Upload it again.")
+        self.frame_id = frame_id
+
+
 @dataclass(frozen=True, slots=True)
 class MissionPhotos:
     """One mission's photos as `core.fusion` asks for them."""
@@ -124,8 +140,11 @@ class MissionPhotos:
     max_side: int | None
 
     def photo(self, frame_id: str) -> Pixels:
-        """See core.fusion.Photos."""
-        return self.shelf.picture_of(self.mission_id, frame_id, self.max_side)
+        """See core.fusion.Photos. Raises FileGone."""
+        try:
+            return self.shelf.picture_of(self.mission_id, frame_id, self.max_side)
+        except ObjectNotFound as error:
+            raise FileGone(frame_id) from error
 
     def thumb(self, frame_id: str) -> Pixels:
         """See core.fusion.Photos."""

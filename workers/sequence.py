@@ -285,6 +285,7 @@ def _rests(mission: Mission) -> bool:
 
 def _solve_all(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:
     matches = _matches(mission.id, None) if mission.mode == "visual" else []
+    matches = [m for m in matches if {m.low, m.high} <= known.seen.keys()]  # one's photo may be lost
     scale = KnownScale.from_json(mission.scale)
     seen, points = [known.seen[k] for k in sorted(known.seen)], surveyed.points_of(mission.id)
     return solved(seen, Canonical((), (), tuple(matches)), scale, points)

@@ -20,7 +20,7 @@ from services.api.documents import FrameState, UploadedFrame, UploadOut
 from services.api.multipart import FormReader, ReceivedFile, clean_name
 from services.api.problems import AllRefused, BadUpload, NoPhotos, as_ours
 from services.catalog import frames, missions
-from services.catalog.frames import INTERNAL
+from services.catalog.frames import NOT_ITS_FAULT
 from services.errors import FrameNotFound, OutOfDisk
 from services.tables import Frame
 
@@ -192,7 +192,7 @@ def _keep(
     services: Services, mission_id: str, file: ReceivedFile, header: PhotoHeader, telemetry: Any
 ) -> UploadedFrame:
     known = _known(services, mission_id, file.frame_id)
-    if known is not None and known.reason_code != INTERNAL:
+    if known is not None and known.reason_code not in NOT_ITS_FAULT:
         return _uploaded(known, file, created=False)
     assert file.path is not None  # the probe refuses what is larger than the limit
     services.store.put_file(f"missions/{mission_id}/photos/{file.frame_id}", file.path)

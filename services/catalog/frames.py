@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, and_, func, or_, select, tuple_, update
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from core.errors import OrthostreamError
+from core.errors import OrthostreamError, PhotoLost
 from core.frame import FrameMeta
 from services.catalog import events, sharpening
 from services.catalog.rows import chunks, clock, insert, lock
@@ -23,6 +23,8 @@ from services.tables import Frame, Mission
 
 STATES = ("received", "ready", "matched", "posed", "fused", "waiting", "rejected")
 WAITING, INTERNAL = "waiting", "internal"
+NOT_ITS_FAULT = (INTERNAL, PhotoLost.code)
+"""Why a photo was rejected that may be tried again when it is uploaded again."""
 WHY_WAITING = (
     "The photo has no GPS and shows nothing yet that a photo on the map shows. It is kept, and goes onto the "
     "map as soon as another photo ties it in."
@@ -162,6 +164,16 @@ def mark_rejected(
     return bool(changed)
 
 
+def mark_lost(tx: Session, mission_id: str, frame_id: str, now: float | None = None) -> bool:
+    """Any state → rejected, because the photo's file is gone; it is no longer among `sightings`."""
+    lock(tx, mission_id)
+    lost = {"state": "rejected", "reason_code": PhotoLost.code, "reason": str(PhotoLost())}
+    values = lost | {"matched_at": None, "island": None}
+    changed = _set(tx, mission_id, [frame_id], tuple(s for s in STATES if s != "rejected"), values)
+    events.append_frames(tx, mission_id, "rejected", changed, now, code=PhotoLost.code)
+    return bool(changed)
+
+
 def mark_posed(
     tx: Session, mission_id: str, frame_ids: Iterable[str], now: float | None = None
 ) -> Sequence[str]:
@@ -222,7 +234,7 @@ def retry(tx: Session, mission_id: str, frame_id: str, now: float | None = None)
     """
     mission = lock(tx, mission_id)
     row = get(tx, mission_id, frame_id)
-    if (row.state, row.reason_code) != ("rejected", INTERNAL):
+    if row.state != "rejected" or row.reason_code not in NOT_ITS_FAULT:
         return False
     row.state, row.reason_code, row.reason, row.attempts, row.woken_at = "received", None, None, 0, None
     tx.flush()

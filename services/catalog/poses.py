@@ -11,7 +11,7 @@ from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
 from core.geometry import Camera, Pose, PosedFrame, World
-from services.catalog import frames, leases, tiles
+from services.catalog import frames, leases, sharpening, tiles
 from services.catalog.rows import chunks, clock, insert, lock, mission
 from services.catalog.tiles import Key, TileBox
 from services.tables import FramePose, Mission
@@ -97,6 +97,18 @@ def save(tx: Session, mission_id: str, epoch: int, change: PoseUpdate, now: floa
     frames.mark_posed(tx, mission_id, [p.frame_id for p in change.placed], now)
     tiles.mark_dirty(tx, mission_id, change.dirty, row.generation)
     return row.generation
+
+
+def lose(tx: Session, mission_id: str, frame_id: str, now: float | None = None) -> None:
+    """Take a frame off the map whose photo is gone; what was solved as final is solved again without it."""
+    row = lock(tx, mission_id)
+    frames.mark_lost(tx, mission_id, frame_id, now)
+    _delete(tx, mission_id, [frame_id])
+    row.generation += 1
+    row.final_generation = None
+    if row.state == "sharpening":
+        sharpening.undo(tx, row, clock(now))
+        row.state = "finalising"
 
 
 def load(tx: Session, mission_id: str, box: TileBox | None = None) -> Poses:

@@ -144,6 +144,48 @@ def test_a_full_disk_costs_no_photo_however_long_it_lasts(
     assert bench.frame_states() == {photos[0][0]: "fused"}
 
 
+@pytest.mark.parametrize("when", ["before reading", "before drawing", "before the final map"])
+def test_a_photo_that_is_lost_from_the_store_is_named_and_the_map_goes_on_without_it(
+    bench: Any, photos: list[tuple[str, bytes]], when: str
+) -> None:
+    store, shelf = bench.modules["app"].store, bench.modules["fuse"].shelf
+    name, data = photos[2]
+    key = f"missions/{bench.mission_id}/photos/{frame_id_of(data)}"
+
+    def lose() -> None:
+        store.delete(key)
+        shelf.pictures.clear()
+
+    bench.upload(photos[:5])
+    if when == "before reading":
+        lose()
+    while when == "before drawing" and bench.queue[0][0] != "fuse":
+        task, args = bench.queue.pop(0)
+        bench.handle(task, *args)
+    if when == "before drawing":
+        lose()
+    bench.drain()
+    if when == "before the final map":
+        lose()
+    bench.finalise()
+    bench.drain()
+    assert bench.state == "final"
+    with bench.db.read() as tx:
+        (row,) = frames.list(tx, bench.mission_id, "rejected")
+    assert (row.name, row.reason_code) == (name, "photo_lost")
+    rest = [p for p in photos[:5] if p[0] != name]
+    assert bench.frame_states() == {p[0]: "fused" for p in rest} | {name: "rejected"}
+    assert bench.tiles() == {tuple(k): v for k, v in build(rest).tiles.items()}
+    store.put(key, data)  # it is uploaded again
+    with bench.db.write() as tx:
+        assert frames.retry(tx, bench.mission_id, row.id)
+    bench.send("ingest", bench.mission_id, row.id)
+    bench.drain()
+    bench.finalise()
+    bench.drain()
+    assert bench.tiles() == {tuple(k): v for k, v in build(photos[:5]).tiles.items()}
+
+
 def test_a_torn_photo_is_rejected_at_once_and_the_mission_ends(
     bench: Any, photos: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
