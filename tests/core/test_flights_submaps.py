@@ -141,10 +141,17 @@ def test_sigmas_are_honest(relief_m: float, outage: float) -> None:
     assert np.sqrt((errors**2).mean()) < 2.0
 
 
-def test_a_frame_without_ties_does_not_cost_the_others_their_sigmas() -> None:
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_frame_whose_matches_are_missing_or_all_wrong_costs_the_others_nothing(wrong: bool) -> None:
     m = flown(replace(SERPENTINE, seed=1))
     alone = list(m.shots)[30]
-    solution = solve(m.frames, [v for v in m.canonical.matches if alone not in (v.low, v.high)])
+    rest = [v for v in m.canonical.matches if alone not in (v.low, v.high)]
+    odd = [v for v in m.canonical.matches if alone in (v.low, v.high)] if wrong else []
+    rng = np.random.default_rng(0)
+    odd = [replace(v, uv_high=(v.uv_high[::-1] + rng.uniform(-300, 300, 2)).astype(np.float32)) for v in odd]
+    solution = solve(m.frames, [*rest, *odd])
     assert solution.poses[alone].source == "gnss"
+    assert len(posed(m, solution)) == len(m.frames) - 1
+    assert {(v.low, v.high) for v in odd} == set(solution.dropped_pairs)
     assert np.isfinite(sigmas_m(m, solution)).all()
     assert fitted(*ground(m, solution)).rms_m < 0.1
