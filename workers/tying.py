@@ -30,7 +30,7 @@ def look(mission_id: str, known: Known) -> list[PairKey]:
     seekers = sorted(known.untried)[:LOOKING]
     known.untried -= set(seekers)
     with db.read() as tx:
-        tried = pairs.keys(tx, mission_id)
+        tried = pairs.keys_of(tx, mission_id, seekers)
     everyone = [sighting(mission_id, known.seen[k]) for k in sorted(homes) if k in known.seen]
     found = live_ties(seekers, everyone, homes, tried)
     known.tries |= set(found)

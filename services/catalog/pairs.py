@@ -126,6 +126,16 @@ def computed(tx: Session, mission_id: str) -> int:
     return tx.scalar(query) or 0
 
 
+def keys_of(tx: Session, mission_id: str, frame_ids: Collection[str]) -> Sequence[Key]:
+    """The pairs that any of these frames is part of, sorted."""
+    found: set[Key] = set()
+    for some in chunks(sorted(frame_ids)):
+        for mine in (Pair.low, Pair.high):
+            query = select(Pair.low, Pair.high).where(Pair.mission_id == mission_id, mine.in_(some))
+            found |= {(low, high) for low, high in tx.execute(query)}
+    return sorted(found)
+
+
 def accepted(tx: Session, mission_id: str, touching: Collection[str] | None = None) -> Sequence[bytes]:
     """The matches of the accepted pairs, sorted by (low, high); `touching`: only those of these frames."""
     if touching is None:

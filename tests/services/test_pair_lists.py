@@ -31,6 +31,9 @@ def test_pairs_are_listed_in_order_by_frame_and_by_verdict(db: Database, mission
         assert pairs.list(tx, mission_id, 9, frame_id="c") == every[1:3]
         assert pairs.list(tx, mission_id, 9, accepted=True) == [every[0], every[2]]
         assert pairs.list(tx, mission_id, 9, accepted=False) == [every[1], every[3]]
+        assert pairs.keys_of(tx, mission_id, ["a", "d"]) == [KEYS[0], KEYS[1], KEYS[3]]
+        assert pairs.keys_of(tx, mission_id, []) == []
+        assert pairs.verdicts(tx, mission_id, KEYS[1:]) == {KEYS[1]: False, KEYS[2]: True}
 
 
 def test_maps_are_counted_by_the_source_of_their_poses(db: Database, mission_id: str) -> None:
