@@ -186,7 +186,7 @@ def observations(
     checkpoints: Checkpoints, world: World, frames: Mapping[str, PosedFrame]
 ) -> list[Observation]:
     """Every sighting in a visually posed frame (by photo name), in the order of the file."""
-    index = _Names(frames)
+    index = PhotoNames(frames)
     shot = [(s, frames[name]) for s in checkpoints.sightings if (name := index.find(s.image))]
     seen = [(s, f) for s, f in shot if f.pose.source != "gnss"]
     if not seen:
@@ -251,7 +251,7 @@ def checkpoints_document(
     seen = observations(checkpoints, world, frames) if world else []
     checks = [o for o in seen if o.sighting.point not in checkpoints.used]
     through_poses, in_mosaic = point_errors(seen), (shown or {}).get("points", {})
-    names = _Names(here)
+    names = PhotoNames(here)
     near = {s.point for s in checkpoints.sightings if names.find(s.image)}
 
     def entry(point: str) -> dict[str, Any]:
@@ -268,7 +268,7 @@ def checkpoints_document(
     }
 
 
-class _Names:
+class PhotoNames:
     """Photos by name, or by the file name alone where photos carry folders or the list does."""
 
     def __init__(self, names: Collection[str]) -> None:

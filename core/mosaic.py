@@ -11,6 +11,8 @@ from hashlib import sha256
 
 import numpy as np
 
+from core.alignment import marks_of
+from core.checkpoints import Checkpoints
 from core.coverage import FUSION, blocks, draw_block, mission_zoom, pyramid, tiles_under
 from core.decode import Pixels, decode_rgb
 from core.errors import NotPlaceable, RejectedFrame
@@ -192,10 +194,16 @@ def build(
 
 
 def solved(
-    frames: Sequence[GraphFrame], pairs: Canonical, scale: KnownScale = UNKNOWN
+    frames: Sequence[GraphFrame],
+    pairs: Canonical,
+    scale: KnownScale = UNKNOWN,
+    points: Checkpoints | None = None,
 ) -> tuple[Solution, SubmapGraph]:
-    """The final poses, and which submaps they were made of; a function of the sets."""
-    solution = solve(frames, pairs.matches, _scaled(scale, frames))
+    """The final poses, and which submaps they were made of; a function of the sets.
+
+    `points`: surveyed, of which those that are used hold the map in place.
+    """
+    solution = solve(frames, pairs.matches, _scaled(scale, frames), marks=marks_of(points, frames))
     poses = {**solution.islands, **solution.poses}
     return solution, submap_graph(frames, pairs.matches, poses, solution.dropped_pairs, pairs.extra)
 

@@ -1,14 +1,13 @@
-"""A mission's surveyed points: the solution laid onto some of them, the finished map measured by the rest."""
+"""A mission's surveyed points, and where its mosaic shows them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.alignment import aligned
 from core.checkpoints import Checkpoints, by_name, observations
 from core.cog import DEFAULT as MOSAIC
 from core.cog import mosaic_grid
@@ -19,7 +18,6 @@ from core.geometry import World
 from core.grid import UtmGrid
 from core.mosaic_points import look_up, mosaic_document, mosaic_errors, mosaic_points
 from core.outline import ground_outline
-from core.pose_graph import GraphFrame, Solution
 from services.catalog import surveys
 from services.tables import Mission
 from workers.app import db
@@ -30,14 +28,6 @@ def points_of(mission_id: str) -> Checkpoints | None:
     """The mission's surveyed points."""
     with db.read() as tx:
         return surveys.checkpoints(tx, mission_id)
-
-
-def held(solution: Solution, graph: Mapping[str, GraphFrame], points: Checkpoints | None) -> Solution:
-    """The solution with the points that are used where the survey says."""
-    if points is None or not points.used:
-        return solution
-    names = {k: f.name for k, f in graph.items()}
-    return aligned(solution, names, {k: f.meta.camera_key for k, f in graph.items()}, points)
 
 
 def in_mosaic(

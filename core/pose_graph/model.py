@@ -19,6 +19,21 @@ class GraphFrame:
 
 
 @dataclass(frozen=True, slots=True)
+class Mark:
+    """A surveyed point where a person marked it in a photo: `uv` in pixels of the original photo.
+
+    `alt_m`: None where the survey does not tell it.
+    """
+
+    point: str
+    frame_id: str
+    uv: tuple[float, float]
+    lon_deg: float
+    lat_deg: float
+    alt_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class PoseParams:
     """How much the pose graph believes in what. Lengths in metres, angles in radians.
 
@@ -34,6 +49,9 @@ class PoseParams:
     `focal_frames` photos; with more it is held in proportion. Without GPS the scale comes from the first
     frame (Avola 2019, 2.1): `first_height_m` above ground, or `ground_px_per_m`, pixels per metre of ground
     as a marker of known size shows them, in the photo of the name `scale_image` if that is given.
+    Surveyed points: `control_sigma_m` of their places, `control_px` of their marks, `control_height_sigma_m`
+    of a point above the plane of its photo; `control_bend_m` and `control_turn_sigma` (scale, and radians):
+    how far the map may be off before they hold it, so that points close together only shift it.
     """
 
     points_per_edge: int = 32
@@ -70,6 +88,11 @@ class PoseParams:
     far_m: float = 50_000.0
     oblique_ratio: float = 10.0
     min_downward: float = 0.4
+    control_sigma_m: float = 0.05
+    control_px: float = 1.0
+    control_height_sigma_m: float = 1.0
+    control_bend_m: float = 0.1
+    control_turn_sigma: float = 0.02
     self_calibrate: bool = True
     min_frames_to_calibrate: int = 8
     coarse_steps: int = 6

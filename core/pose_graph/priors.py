@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from core.geometry import Array
+from core.pose_graph.control import Control, add_control
 from core.pose_graph.residuals import IntArray, Normal, State
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -21,7 +22,7 @@ class Priors:
     `gps` (N, 3) m and `velocity` (N, 2) m/s with `drone` (N,); `anchor` (N, 3) m; `down` (N, 3) unit vector
     to the earth in the camera's frame, `gimballed` (N,) 1 where a gimbal says so and 0 where not; `yaw` (N,)
     rad; `height` (N,) m above ground, its sigma in log units. `ground_step_sigma_m`: between the two frames
-    of a pair. `lens` (C, 3) px, 1, 1 with `lens_sigma` (C, 3) in log f, k1, k2.
+    of a pair. `lens` (C, 3) px, 1, 1 with `lens_sigma` (C, 3) in log f, k1, k2. `control`: surveyed points.
     """
 
     gps: Array
@@ -41,6 +42,7 @@ class Priors:
     lens: Array
     lens_sigma: Array
     lag_sigma_s: float
+    control: Control | None = None
 
 
 def gravity(R: Array) -> Array:
@@ -65,6 +67,8 @@ def add_priors(priors: Priors, pairs: IntArray, state: State, normal: Normal) ->
     cost += _add_yaw(priors, state, normal)
     cost += _add_height(priors, state, normal)
     cost += _add_ground_steps(priors, pairs, state, normal)
+    if priors.control is not None:
+        cost += add_control(priors.control, state, normal)
     return cost + _add_border(priors, state, normal)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,23 +12,25 @@ from core.geometry import Array, Camera, Pose, World
 from core.matching import PairMatch
 from core.pose_graph.adjustment import Adjusted, adjust
 from core.pose_graph.certainty import position_sigmas
+from core.pose_graph.control import Control, Similarity, control_of, laid_onto, with_pixels
 from core.pose_graph.fallback import gnss_poses, is_oblique
+from core.pose_graph.learning import MEDIAN_2D, learnt
 from core.pose_graph.matchgraph import edges_of, submaps
-from core.pose_graph.model import GraphFrame, PoseParams, Solution
-from core.pose_graph.priors import Priors, gravity, heading, nadir
+from core.pose_graph.model import GraphFrame, Mark, PoseParams, Solution
+from core.pose_graph.priors import Priors, heading
 from core.pose_graph.residuals import Edges, IntArray, State
 from core.pose_graph.start import Start, expected_down, first_of_known_height, starting, yaw_offsets
 from core.pose_graph.survey import Survey, capture_order, survey
 
 WILD = 10.0
-MIN_OPPOSITE = 10
-# Median of |x| and of a plane vector's length → standard deviation per axis.
-MEDIAN_1D, MEDIAN_2D = 1.4826, 1.1774
 
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """Tied frames (a part of the survey, `rows` of it), their pairs, and where they ended up."""
+    """Tied frames (a part of the survey, `rows` of it), their pairs, and where they ended up.
+
+    `laid`: how surveyed points moved the map before they held it.
+    """
 
     s: Survey
     rows: IntArray
@@ -39,6 +40,7 @@ class Graph:
     gps_sigma: Array
     sigma_px: Array
     sigma_m: Array
+    laid: Similarity | None = None
 
 
 def solve(
@@ -46,10 +48,12 @@ def solve(
     matches: Sequence[PairMatch],
     params: PoseParams | None = None,
     world: World | None = None,
+    marks: Sequence[Mark] = (),
 ) -> Solution:
     """Poses of all frames from all their matches; a function of the sets, whatever their order.
 
-    `world` keeps the origin of an earlier solution. Every frame is in `poses` or in `unplaced`.
+    `world` keeps the origin of an earlier solution. Every frame is in `poses` or in `unplaced`. `marks`: of
+    the surveyed points that hold the map in place.
     """
     params = params or PoseParams()
     s = survey(frames, params, world)
@@ -57,11 +61,13 @@ def solve(
     away = known & (down[:, 2] < params.min_downward)
     index = {f.frame_id: k for k, f in enumerate(s.frames) if not away[k]}
     edges = edges_of(matches, index, s.cameras, s.camera, params)
-    graph = optimise(s, edges, params) if len(edges) else None
+    graph = optimise(s, edges, params, marks) if len(edges) else None
+    if graph is not None and graph.laid is not None:
+        s = replace(s, gps=graph.laid.places(s.gps))
     return _solution(s, graph, params)
 
 
-def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
+def optimise(s: Survey, edges: Edges, params: PoseParams, marks: Sequence[Mark] = ()) -> Graph:
     """Start values, a coarse adjustment, wrong pairs out, and the fine one with lenses and lags free."""
     rows = np.unique(edges.pairs)
     tied = s.take(rows)
@@ -82,16 +88,47 @@ def optimise(s: Survey, edges: Edges, params: PoseParams) -> Graph:
     # relief makes most of the residuals: what this ground does decides how far a match is believed
     observed = float(np.sqrt(np.median(coarse.squared))) / MEDIAN_2D
     sigma = sigma * np.clip(observed, *params.sigma_range)
-    priors = _learnt(tied, edges.pairs, priors, coarse.state, params)
-    same = coarse.structure if good.all() else None
-    scale = params.robust_scale
-    fine = adjust(edges, priors, coarse.state, sigma, scale, params.fine_steps, 1.5e-4, structure=same)
+    control = control_of(tied, marks, params) if tied.has_gps.any() else None
+    laid = laid_onto(control, coarse.state, params) if control else None
+    if laid is not None:
+        priors, coarse = _laid(priors, laid), replace(coarse, state=laid.state(coarse.state))
+    priors = learnt(tied, edges.pairs, priors, coarse.state, params)
+    fine, fine_steps = coarse, 0
+    for known in _control_rounds(control, coarse.state, params):
+        fine = adjust(
+            edges, replace(priors, control=known), fine.state, sigma, params.robust_scale, params.fine_steps,
+            1.5e-4, structure=fine.structure if len(fine.normal.pair) == len(edges) else None,
+        )  # fmt: skip
+        fine_steps += fine.steps
     left = {tuple(p) for p in edges.pairs.tolist()}
     ids = [f.frame_id for f in tied.frames]
     dropped = tuple((ids[i], ids[j]) for i, j in every.pairs.tolist() if (i, j) not in left)
-    fine = replace(fine, steps=fine.steps + coarse.steps)
+    fine = replace(fine, steps=fine_steps + coarse.steps)
     sigma_m = position_sigmas(fine, priors, edges.pairs, _origins(tied, edges.pairs, names))
-    return Graph(tied, rows, edges, fine, dropped, priors.gps_sigma, sigma, sigma_m)
+    return Graph(tied, rows, edges, fine, dropped, priors.gps_sigma, sigma, sigma_m, laid)
+
+
+def _control_rounds(control: Control | None, state: State, params: PoseParams) -> list[Control | None]:
+    """What the fine adjustment is to believe of surveyed points: first no more than they fit so far, so that
+    points which the map bends away from are not taken for wrong ones.
+    """
+    if control is None:
+        return [None]
+    control = with_pixels(control, state, params)
+    return [control.loosened(state), control]
+
+
+def _laid(priors: Priors, laid: Similarity) -> Priors:
+    """Priors after the map, and GPS with it, was laid onto surveyed points."""
+    velocity = laid.turn * (priors.velocity @ (1, 1j))
+    return replace(
+        priors,
+        gps=laid.places(priors.gps),
+        velocity=np.column_stack((velocity.real, velocity.imag)),
+        anchor=laid.places(priors.anchor),
+        yaw=priors.yaw - np.angle(laid.turn),
+        height=priors.height * abs(laid.turn),
+    )
 
 
 def _origins(s: Survey, pairs: IntArray, names: Sequence[tuple[str, str]]) -> IntArray:
@@ -160,63 +197,6 @@ def priors_of(s: Survey, start: Start, submap: IntArray, params: PoseParams) -> 
         lens_sigma=lens_sigma,
         lag_sigma_s=params.lag_sigma_s,
     )
-
-
-def _learnt(s: Survey, pairs: IntArray, priors: Priors, state: State, params: PoseParams) -> Priors:
-    """Priors after the coarse adjustment: how good each drone's GPS is, and how its camera is mounted."""
-    gps_sigma, altitude_sigma = priors.gps_sigma.copy(), priors.altitude_sigma.copy()
-    miss = np.column_stack((nadir(priors, state)[0], state.t[:, 2])) - priors.gps
-    for d in range(len(s.drones)):
-        mine = (s.drone == d) & s.has_gps
-        if mine.sum() >= params.min_frames_to_learn:
-            observed = max(
-                float(np.median(np.hypot(*miss[mine, :2].T))) / MEDIAN_2D, params.gps_learnt_floor_m
-            )
-            stated = s.gps_sigma[mine] < params.gps_sigma_m
-            gps_sigma[mine] = np.where(stated, np.maximum(s.gps_sigma[mine], observed), observed)
-        high = mine & np.isfinite(miss[:, 2])
-        if high.sum() >= params.min_frames_to_learn:
-            observed = MEDIAN_1D * float(np.median(np.abs(miss[high, 2] - np.median(miss[high, 2]))))
-            observed = min(max(observed, params.altitude_learnt_floor_m), params.altitude_sigma_m)
-            altitude_sigma[high] = observed
-    return _mounted(
-        s, pairs, replace(priors, gps_sigma=gps_sigma, altitude_sigma=altitude_sigma), state, params
-    )
-
-
-def _mounted(s: Survey, pairs: IntArray, priors: Priors, state: State, params: PoseParams) -> Priors:
-    """What a gimbal or an airframe adds to the expected way down, in the camera's own frame; and, where no
-    gimbal tells, how much of the tilt is the ground's.
-    """
-    down, tilt, known = priors.down.copy(), priors.tilt_sigma.copy(), priors.gimballed > 0
-    lean = (gravity(state.R) - priors.down)[:, :2]
-    for d, c, gimbal in product(range(len(s.drones)), np.unique(s.camera), (True, False)):
-        group = (s.drone == d) & (s.camera == c) & (known == gimbal)
-        if group.sum() < params.min_frames_to_learn:
-            continue
-        middle = np.median(lean[group], axis=0)
-        off = float(np.median(np.linalg.norm(lean[group] - middle, axis=1))) / MEDIAN_2D
-        down[group, :2] += middle
-        tilt[group] = params.gimbal_sigma_rad if gimbal else max(params.tilt_floor_rad, off)
-    down /= np.linalg.norm(down, axis=1, keepdims=True)
-    slope = _share_of_ground(pairs[~known[pairs[:, 0]] & ~known[pairs[:, 1]]], down, state)
-    return replace(priors, down=down, tilt_sigma=tilt, gimballed=np.where(known, 1.0, slope))
-
-
-def _share_of_ground(pairs: IntArray, down: Array, state: State) -> float:
-    """How much of the cameras' tilt comes from sloping ground (0 … 1).
-
-    A slope tilts two neighbours to the same side of the world even when they fly in opposite directions; what
-    the airframe does differs from photo to photo or turns with its heading.
-    """
-    tilt = np.einsum("nij,nj->ni", state.R, down)[:, :2]
-    yaw = heading(state.R)
-    opposite = pairs[np.cos(yaw[pairs[:, 0]] - yaw[pairs[:, 1]]) < -0.5]
-    if len(opposite) < MIN_OPPOSITE:
-        return 0.0
-    first, second = tilt[opposite[:, 0]], tilt[opposite[:, 1]]
-    spread = float(((first**2).sum() + (second**2).sum()) / 2)
-    return float(np.clip((first * second).sum() / max(spread, 1e-12), 0.0, 1.0))
 
 
 def _solution(s: Survey, graph: Graph | None, params: PoseParams) -> Solution:

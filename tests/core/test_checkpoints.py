@@ -20,7 +20,7 @@ from pyproj import Transformer
 from rasterio.windows import Window
 from scipy.spatial.transform import Rotation
 
-from core.alignment import aligned
+from core.alignment import marks_of
 from core.checkpoints import (
     Checkpoints,
     by_name,
@@ -31,11 +31,15 @@ from core.checkpoints import (
 )
 from core.cog import flight_gsd_m, mosaic_grid, write_mosaic
 from core.errors import BadCheckpoints
+from core.frame import FrameMeta
 from core.fusion import FrameIndex, render
 from core.geometry import Array, Camera, Pose, PosedFrame, World
 from core.grid import UtmGrid
 from core.mosaic_points import Lookup, look_up, mosaic_document, mosaic_errors, mosaic_points
-from core.pose_graph import Solution
+from core.pose_graph import GraphFrame, PoseParams
+from core.pose_graph.control import control_of, laid_onto
+from core.pose_graph.residuals import State
+from core.pose_graph.survey import survey as survey_of
 
 CAMERA = Camera(400, 300, 300.0, 199.5, 149.5, k1=-0.02)
 WORLD = World(47.0, 10.4, 400.0)
@@ -254,14 +258,25 @@ def test_a_point_that_is_not_seen_says_why() -> None:
 # ---- the map laid onto points
 
 
-def solution(frames: list[PosedFrame]) -> Solution:
-    return Solution(WORLD, {"c": CAMERA}, {f.frame_id: f.pose for f in frames}, {}, 1.0)
-
-
 def held(frames: list[PosedFrame], points: Checkpoints) -> list[PosedFrame]:
-    same = {f.frame_id: f.frame_id for f in frames}
-    after = aligned(solution(frames), same, dict.fromkeys(same, "c"), points)
-    return [replace(f, pose=after.poses[f.frame_id]) for f in frames]
+    meta = FrameMeta(CAMERA.width, CAMERA.height, CAMERA.f_px)
+    graph = [GraphFrame(f.frame_id, f.frame_id, meta) for f in frames]
+    known = survey_of(graph, PoseParams(), WORLD)
+    control = control_of(known, marks_of(points, graph), PoseParams())
+    if control is None:
+        return frames
+    poses = [{f.frame_id: f.pose for f in frames}[f.frame_id] for f in known.frames]
+    before = State(
+        np.array([p.world_R_cam for p in poses]),
+        np.array([p.center for p in poses]),
+        np.array([p.ground_h_m for p in poses]),
+        np.array([(CAMERA.f_px, CAMERA.k1, CAMERA.k2)]),
+        np.zeros(1),
+    )
+    after = laid_onto(control, before, PoseParams()).state(before)
+    places = zip(known.frames, after.R, after.t, after.h, strict=True)
+    moved_to = {f.frame_id: Pose(R, t, float(h)) for f, R, t, h in places}
+    return [replace(f, pose=moved_to[f.frame_id]) for f in frames]
 
 
 def warped(frame: PosedFrame, turn_rad: float, scale: float, shift: Array) -> PosedFrame:
