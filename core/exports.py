@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from io import StringIO
@@ -97,11 +97,15 @@ def is_local(frames: Sequence[NamedFrame]) -> bool:
 
 
 def poses_document(
-    world: World, frames: Sequence[NamedFrame], waiting: Sequence[WaitingFrame] = ()
+    world: World,
+    frames: Sequence[NamedFrame],
+    waiting: Sequence[WaitingFrame] = (),
+    graph: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The content of poses.json, in the UTM zone of the world's origin, frames in capture order.
 
     A map that is not georeferenced says so; `waiting` frames come apart, in metres of their own islands.
+    `graph`: as `core.submaps.SubmapGraph.to_json` tells submaps and ties.
     """
     epsg = utm_epsg(world.lat_deg, world.lon_deg)
     to_crs = Transformer.from_crs(4326, epsg, always_xy=True)
@@ -116,6 +120,8 @@ def poses_document(
         "cameras": [_camera_entry(camera) for camera in cameras],
         "frames": [_pose_entry(world, f, index[f.posed.camera], to_crs) for f in ordered],
         "waiting": [_waiting_entry(w, index[w.camera]) for w in late],
+        "submaps": (graph or {}).get("submaps", []),
+        "ties": (graph or {}).get("ties", []),
     }
 
 

@@ -136,7 +136,7 @@ def _mosaic(path: Path, mission: Mission, wanted: Export) -> None:
 
 def _poses(path: Path, mission: Mission, _wanted: Export) -> None:
     world, named = _placed(mission)
-    path.write_bytes(json_bytes(poses_document(world, named, _waiting(mission.id))))
+    path.write_bytes(json_bytes(poses_document(world, named, _waiting(mission.id), mission.submaps)))
 
 
 def _waiting(mission_id: str) -> list[WaitingFrame]:

@@ -181,6 +181,7 @@ def test_an_island_without_gps_waits_and_moves_into_place_when_it_is_tied(bench:
     assert [f["name"] for f in document["frames"]] == [name for name, _ in strip[:4]]
     assert [(f["name"], f["source"]) for f in document["waiting"]] == [(n, "vision-only") for n, _ in lost]
     (home,) = {f["submap"] for f in document["waiting"]}
+    assert [s["submap"] for s in document["submaps"]] == [0, home]
     with bench.db.read() as tx:
         told = report(tx, bench.mission_id)
     assert [(s["frames"], s["submap"], s["georeferenced_by"]) for s in told["submaps"]] == [
