@@ -23,6 +23,7 @@ from services.queue import send
 from services.tables import Mission
 from workers import surveyed, tying, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
+from workers.dealing import AHEAD_TILES, runs
 from workers.lease import held
 from workers.photos import Pixels, shelf
 from workers.posing import Known, changed, everything, joined, sharper, update_of
@@ -38,7 +39,7 @@ LIVE_SHARE = 0.85
 """What may be rendered before the final pass, as a share of that pass."""
 FEW = 8
 ASK_AGAIN_S = 10.0
-LIVE_TILES, FINAL_TILES, PAIRS_PER_TASK = 12, 16, 24
+LIVE_TILES, PAIRS_PER_TASK = 12, 24
 WORTH_A_LOOK = 24
 """While so many photos still wait to be read, a mission that is being finished grows live as well."""
 REST_S = 4.0
@@ -379,19 +380,32 @@ def _all_matched(mission_id: str, wanted: set[PairKey]) -> bool:
 
 def _dispatch(mission: Mission, desk: Backlog) -> bool:
     """Hand out tiles, as many at a time as there are workers; one task while photos still wait to be read."""
-    busy = desk.unread > settings.workers
-    sharpens, final = mission.state == "sharpening", mission.final_generation is not None
-    size = LIVE_TILES if sharpens or not final else FINAL_TILES
+    sharpens = mission.state == "sharpening"
+    if mission.final_generation is not None and not sharpens:
+        return _deal(mission, desk)
+    busy, size = desk.unread > settings.workers, LIVE_TILES
     room = size * (1 if busy else settings.workers) - desk.in_flight
     now = time.monotonic()
     if room <= 0 or (busy and now < _rested.get(mission.id, 0.0)):
         return False
     _rested[mission.id] = now + REST_S
     with db.write() as tx:
-        claimed = tiles.claim_dirty(tx, mission.id, room, CLAIM_TTL_S, by_place=final)
+        claimed = tiles.claim_dirty(tx, mission.id, room, CLAIM_TTL_S, by_place=sharpens)
     keys = [(d.z, d.x, d.y) for d in claimed]
     if not busy:  # few tiles are shared out evenly, so that they are there soon
         size = min(size, max(4, -(-len(keys) // settings.workers)))
     for start in range(0, len(keys), size):
         send("fuse", mission.id, keys[start : start + size], priority=SPARE if sharpens else None)
+    return False
+
+
+def _deal(mission: Mission, desk: Backlog) -> bool:
+    """Hand out the final pass, before the workers have drawn what they were given last."""
+    ahead = AHEAD_TILES * settings.workers
+    if 2 * desk.in_flight > ahead:
+        return False
+    with db.write() as tx:
+        claimed = tiles.claim_dirty(tx, mission.id, ahead - desk.in_flight, CLAIM_TTL_S, by_place=True)
+    for run in runs([(d.z, d.x, d.y) for d in claimed], desk.to_render, settings.workers):
+        send("fuse", mission.id, run)
     return False

@@ -121,13 +121,13 @@ def claim_dirty(
     """Tiles to render now, best priority first, 2 × 2 siblings together; they are the caller's for `ttl_s`.
 
     At most `limit_tiles`, or one block of siblings when the limit is smaller than that. Of equal priority,
-    the longest waiting come first; `by_place`: neighbours, which share their photos.
+    the longest waiting come first; `by_place`: neighbours, which share their photos, along strips four high.
     """
     lock(tx, mission_id)
     now = clock(now)
     free = _claimable(mission_id, ttl_s, now)
     block = _block()
-    place = (func.min(DirtyTile.x.op(">>")(3)), func.min(DirtyTile.y.op(">>")(2)))
+    place = (func.min(DirtyTile.y.op(">>")(2)), func.min(DirtyTile.x.op(">>")(1)))
     then = place if by_place else (func.min(DirtyTile.since),)
     first = (func.min(DirtyTile.priority), *then, *block)
     query = select(*block, func.count()).where(free).group_by(*block).order_by(*first).limit(limit_tiles)

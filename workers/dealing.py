@@ -1,0 +1,33 @@
+"""How the final pass is shared out: in runs of neighbouring tiles, long ones first, short ones at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from services.catalog.tiles import Key
+
+SHORTEST, LONGEST = 8, 48
+AHEAD_TILES = 96
+"""So many tiles a worker are handed out at most: enough that none waits for the next ones."""
+
+
+def runs(tiles: Iterable[Key], to_render: int, workers: int) -> list[list[Key]]:
+    """`tiles` in their order, cut between blocks of 2 × 2; `to_render`: how many are left of the whole pass.
+
+    Neighbours share their photos, so that a long run decodes each of them fewer times; but while the last run
+    is drawn the other workers have nothing to do, so that the last ones are short.
+    """
+    found: list[list[Key]] = []
+    run: list[Key] = []
+    for tile in tiles:
+        size = min(max(-(-to_render // (2 * workers)), SHORTEST), LONGEST)
+        if len(run) >= size and _block(run[-1]) != _block(tile):
+            found.append(run)
+            to_render, run = to_render - len(run), []
+        run.append(tile)
+    return [*found, run] if run else found
+
+
+def _block(tile: Key) -> Key:
+    z, x, y = tile
+    return z, x >> 1, y >> 1
