@@ -9,16 +9,20 @@ from functools import cache
 
 import numpy as np
 import pytest
+from pyproj import Transformer
 
 from core.frame import Attitude, FrameMeta
 from core.matching import MatchCounts, PairMatch
-from core.pose_graph import GraphFrame, Solution, place, solve
+from core.pose_graph import GraphFrame, PoseParams, Solution, place, solve
 from core.pose_graph.attitude import circular_median, levelling, rotation_of
 from core.pose_graph.averaging import moments
 from core.pose_graph.chaining import spanned
 from core.pose_graph.fixes import contradicted
+from core.pose_graph.matchgraph import edges_of, submaps
 from core.pose_graph.residuals import rotations
 from core.pose_graph.rotations import Absolute, absolute_rotations, angles, averaged_rotations, horn
+from core.pose_graph.start import starting
+from core.pose_graph.survey import Survey, survey
 from core.pose_graph.twoview import TwoViews, two_views
 from core.simulation import Flight, FlightParams, Shot, plan_flight
 
@@ -367,3 +371,64 @@ def test_no_attitude_at_all_is_no_loss_where_there_is_gps() -> None:
     assert blind.dropped_pairs == ()
     level = [np.degrees(np.arccos(-p.world_R_cam[2, 2])) for p in blind.poses.values()]
     assert max(level) < 8
+
+
+# Receivers
+
+
+def off_m(flight: Flown, solution: Solution) -> float:
+    """RMS error of the ground below the photos' middles, metres."""
+    to_grid = Transformer.from_crs(4326, flight.flight.epsg, always_xy=True)
+    missed = []
+    for frame, shot in zip(flight.frames, flight.shots, strict=True):
+        camera = solution.cameras[frame.meta.camera_key]
+        middle = np.array([[camera.cx, camera.cy]])
+        ground = solution.poses[frame.frame_id].ground(camera, middle)
+        lon, lat, _ = solution.world.to_geodetic(ground)[0]
+        missed.append(np.array(to_grid.transform(lon, lat)) - flight.flight.ground(shot, middle)[0, :2])
+    return float(np.sqrt((np.array(missed) ** 2).sum(1).mean()))
+
+
+def differing(flight: Flown, *north_m: float) -> Flown:
+    """With receivers that are off by a constant."""
+    return flight.claiming(lambda _, m: moved(m, north_m[int(m.drone[-1]) - 1]))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_receivers_that_differ_do_not_bend_the_map(seed: int) -> None:
+    flight = flown(frames=90, drones=3, gps_noise_m=1.0, seed=seed)
+    alike, apart = flight.solve(), differing(flight, 4.0, -3.0, -1.0).solve()
+    assert off_m(flight, apart) < off_m(flight, alike) + 1.0
+    # each receiver is found to be as noisy as it is, not as wrong as it is
+    for drone, sigma_m in apart.gps_sigma_m.items():
+        assert sigma_m < 1.25 * alike.gps_sigma_m[drone]
+
+
+def test_receivers_that_agree_are_left_alone() -> None:
+    for seed in range(3):
+        flight = flown(frames=60, drones=2, gps_noise_m=2.0, seed=seed)
+        rows, s = _starting(flight)
+        np.testing.assert_array_equal(s.gps, rows.gps)
+
+
+def test_the_receiver_that_claims_less_gives_way() -> None:
+    flight = flown(frames=60, drones=2, gps_noise_m=0.05)
+
+    def surveyed(_: int, meta: FrameMeta) -> FrameMeta:
+        assert meta.gps
+        return replace(meta, gps=replace(meta.gps, sigma_h_m=0.05)) if meta.drone == "drone 1" else meta
+
+    told = differing(flight, 0.0, 4.0).claiming(surveyed)
+    before, after = _starting(told)
+    moved_m = np.abs(before.gps - after.gps).max(1)
+    own = after.drone == after.drones.index("drone 1")
+    assert moved_m[own].max() < 0.2
+    assert moved_m[~own].min() > 2.0
+
+
+def _starting(flight: Flown) -> tuple[Survey, Survey]:
+    """The survey as it was read, and as start values correct it."""
+    s = survey(flight.frames, PoseParams())
+    index = {f.frame_id: k for k, f in enumerate(s.frames)}
+    edges = edges_of(flight.matches, index, s.cameras, s.camera, PoseParams())
+    return s, starting(s, edges, submaps(len(s), edges.pairs, range(len(s))), PoseParams()).survey
