@@ -72,6 +72,9 @@ def _placement(frames: Sequence[dict[str, Any]], scale: Mapping[str, Any] | None
     """What kind of poses the map is made of, where it is not the best kind."""
     if any(f["source"] == "vision-only" for f in frames):
         yield _SCALED if scale and scale["used"] else _UNSCALED
+        parts = len({f["submap"] for f in frames})
+        if parts > 1:
+            yield f"No photo ties its {parts} parts together: they are drawn side by side."
     by_gps = [f["name"] for f in frames if f["source"] == "gnss"]
     if by_gps and len(frames) > 1:
         yield (

@@ -498,6 +498,14 @@ def test_half_the_first_height_is_half_the_map() -> None:
     assert scales[1] / scales[0] == pytest.approx(2.0, rel=0.02)
 
 
+def test_parts_that_tie_nowhere_are_taken_to_be_flown_at_the_first_height() -> None:
+    flight = without_gps(fly()).cut(range(24), range(24, 48))
+    solution = solve(flight.frames, flight.matches, PoseParams(first_height_m=90.0))
+    assert {p.submap for p in solution.poses.values()} == {0, 1}
+    heights = [p.center[2] - p.ground_h_m for p in solution.poses.values()]
+    assert heights == pytest.approx([90.0] * 48, rel=0.1)
+
+
 def test_without_gps_sigmas_grow_with_the_distance_from_the_first_frame() -> None:
     flight = without_gps(fly(1, 40))
     solution = solve(flight.frames, flight.matches, PoseParams(first_height_m=60.0))

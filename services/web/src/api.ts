@@ -43,6 +43,7 @@ export interface TieOut {
 }
 
 export interface Submaps {
+  maps: { submap: number; frames: number }[];
   submaps: SubmapOut[];
   ties: TieOut[];
 }

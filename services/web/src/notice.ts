@@ -9,10 +9,11 @@ export class Notice {
   private readonly local = h("p", {});
   private readonly height = h("input", { type: "number", min: 1, max: 99999, step: "any", required: true, "aria-label": "Height of the first photo above ground, metres" });
   private readonly form = h("form", { class: "scale" }, h("span", {}, "First photo at"), this.height, h("span", {}, "m"), h("button", { type: "submit" }, "Set scale"));
+  private readonly parts = h("p");
   private readonly waiting = h("p", { class: "waiting" });
 
   constructor(setHeight: (height_m: number) => void) {
-    fill(this.root, this.local, this.form, this.waiting);
+    fill(this.root, this.local, this.parts, this.form, this.waiting);
     this.form.addEventListener("submit", (event) => {
       event.preventDefault();
       setHeight(this.height.valueAsNumber);
@@ -20,12 +21,15 @@ export class Notice {
     });
   }
 
-  set({ georeferenced, scale, progress }: Mission): void {
+  /** `parts`: maps that no photo ties together. */
+  set({ georeferenced, scale, progress }: Mission, parts: number): void {
     const late = progress.counts.waiting;
     const local = georeferenced === false;
     this.root.hidden = !local && late === 0;
     this.local.hidden = this.form.hidden = !local;
     this.waiting.hidden = late === 0;
+    this.parts.hidden = !local || parts < 2;
+    text(this.parts, `No photo ties its ${parts} parts together: they are drawn side by side.`);
     fill(this.local, h("strong", {}, "Not georeferenced. "), scale
       ? "No photo has GPS: place and north are assumed, the scale is as it was given."
       : "No photo has GPS: place, north and scale are assumed. Do not measure in it.");

@@ -75,8 +75,8 @@ export class Panel {
   private readonly notice: Notice;
   private readonly submaps = new SubmapsSection();
   private colours: ReadonlyMap<string, string> = new Map();
-  private hangingTogether: Submaps = { submaps: [], ties: [] };
-  private local = false;
+  private hangingTogether: Submaps = { maps: [], submaps: [], ties: [] };
+  private mission: Mission | null = null;
   private readonly stages = {
     uploaded: stat("Uploaded", "Photos that arrived and are safe"),
     matched: stat("Matched", "Compared with their neighbours"),
@@ -160,15 +160,16 @@ export class Panel {
 
   setMission(mission: Mission): void {
     text(this.title, mission.name);
-    this.local = mission.georeferenced === false;
-    this.notice.set(mission);
-    this.submaps.set(this.hangingTogether, this.local, this.colours);
+    this.mission = mission;
+    this.setSubmaps(this.hangingTogether);
     this.setProgress(mission.progress);
   }
 
   setSubmaps(known: Submaps): void {
     this.hangingTogether = known;
-    this.submaps.set(known, this.local, this.colours);
+    if (!this.mission) return;
+    this.notice.set(this.mission, known.maps.length);
+    this.submaps.set(known, this.mission.georeferenced === false, this.colours);
   }
 
   setProgress(progress: Progress): void {
@@ -252,7 +253,7 @@ export class Panel {
     if (now === this.lastLegend) return;
     this.lastLegend = now;
     this.colours = new Map(drones);
-    this.submaps.set(this.hangingTogether, this.local, this.colours);
+    this.setSubmaps(this.hangingTogether);
     fill(this.drones, ...drones.map(legendEntry));
     fill(this.sources, ...sources.map(legendEntry));
   }
