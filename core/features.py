@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.sift import Spots, describe, find_spots, scale_space
 from core.vocabulary import appearance
 
 Floats = NDArray[np.float32]
@@ -34,7 +34,7 @@ class FeatureParams:
     `octave_layers`: SIFT's scales per octave. `thumb_px`: long side of the thumbnail.
     """
 
-    side_px: int = 544
+    side_px: int = 512
     keypoints: int = 1000
     cells: int = 8
     contrast: float = 0.01
@@ -97,21 +97,21 @@ def extract(
     """Finds and describes the keypoints of a photo (Zhao 2020, 3.2).
 
     `rgb`: uint8 (H, W, 3), the photo at any resolution; `original_size`: (width, height) of the photo itself,
-    in whose pixels the keypoints come back. About 75 ms on one core.
+    in whose pixels the keypoints come back. About 40 ms on one core.
     """
     params = params or FeatureParams()
     copy = _shrunk(rgb, params.side_px)
-    gray = cv2.cvtColor(copy, cv2.COLOR_RGB2GRAY)
-    found = _detect(gray, params)
-    chosen, sift_descriptors = _sift(params).compute(gray, found) if found else ((), None)
-    descriptors = _root_sift(sift_descriptors)
+    gray = np.asarray(cv2.cvtColor(copy, cv2.COLOR_RGB2GRAY), np.uint8)
+    space = scale_space(gray, params.octave_layers)
+    spots = find_spots(space, params.contrast)
+    found = describe(space, spots.take(_chosen(spots, gray.shape, params)), params.keypoints)
+    descriptors = _root_sift(found.histograms)
     height, width = gray.shape
     to_original = np.array((original_size[0] / width, original_size[1] / height))
-    xy = np.array([k.pt for k in chosen]).reshape(-1, 2)
     return Features(
-        keypoints=((xy + 0.5) * to_original - 0.5).astype(np.float32),
-        angle_rad=np.radians([k.angle for k in chosen]).astype(np.float32),
-        scale_px=(np.array([k.size for k in chosen]) * np.sqrt(to_original.prod())).astype(np.float32),
+        keypoints=((found.xy + 0.5) * to_original - 0.5).astype(np.float32),
+        angle_rad=found.angle_rad,
+        scale_px=(found.size_px * np.sqrt(to_original.prod())).astype(np.float32),
         descriptors=descriptors,
         words=appearance(descriptors),
         thumb=_shrunk(copy, params.thumb_px),
@@ -128,25 +128,15 @@ def _shrunk(rgb: NDArray[np.uint8], side_px: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _detect(gray: NDArray[Any], params: FeatureParams) -> list[cv2.KeyPoint]:
-    """The strongest keypoints of every grid cell, the strongest of all cells first."""
-    found = _sift(params).detect(gray)
-    # Response alone may tie; position and angle make the order, and so the choice, unique.
-    facts = np.array([(k.response, *k.pt, k.angle, k.size) for k in found]).reshape(-1, 5)
-    ranked = np.lexsort((facts[:, 4], facts[:, 3], facts[:, 1], facts[:, 2], -facts[:, 0]))
-    height, width = gray.shape
-    column, row = (
-        (facts[ranked, 1:3] / (width, height) * params.cells).clip(0, params.cells - 1).astype(int).T
-    )
-    rank = rank_in_cell(row * params.cells + column)
+def _chosen(spots: Spots, shape: tuple[int, ...], params: FeatureParams) -> NDArray[np.intp]:
+    """Rows of the strongest spots of every grid cell, all cells' strongest first."""
+    # Response alone may tie; the order in which spots are found makes the choice unique.
+    ranked = np.argsort(-spots.response, kind="stable")
+    place = spots.xy()[ranked] / (shape[1], shape[0]) * params.cells
+    column, row = place.clip(0, params.cells - 1).astype(int).T
     # Rank by rank through the cells: a cell with few keypoints leaves its places to the others.
-    chosen = np.argsort(rank, kind="stable")[: params.keypoints]
-    return [found[i] for i in ranked[np.sort(chosen)]]
-
-
-def _sift(params: FeatureParams) -> cv2.SIFT:
-    # Precise upscaling: without it OpenCV's keypoints sit a quarter of a pixel off.
-    return cv2.SIFT.create(0, params.octave_layers, params.contrast, 10, 1.6, enable_precise_upscale=True)
+    turns = np.argsort(rank_in_cell(row * params.cells + column), kind="stable")
+    return np.asarray(ranked[turns[: params.keypoints]])
 
 
 def rank_in_cell(cell: NDArray[np.int_]) -> NDArray[np.int_]:
@@ -158,9 +148,7 @@ def rank_in_cell(cell: NDArray[np.int_]) -> NDArray[np.int_]:
     return rank
 
 
-def _root_sift(descriptors: NDArray[Any] | None) -> Bytes:
+def _root_sift(histograms: Floats) -> Bytes:
     """SIFT (K, 128) → RootSIFT × 512 as uint8 (K, 128): Euclidean distance becomes Hellinger's."""
-    if descriptors is None or not len(descriptors):
-        return np.zeros((0, 128), np.uint8)
-    share = descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
+    share = histograms / np.maximum(histograms.sum(1, keepdims=True), 1e-9)
     return np.asarray(np.minimum(np.sqrt(share) * DESCRIPTOR_SCALE + 0.5, 255), np.uint8)
