@@ -208,7 +208,7 @@ def publish(
         _flip(tx, mission_id, row.revision, news)
         shown = [r.key for r in news]
         events.append(tx, mission_id, "tiles", {"revision": row.revision, "tiles": shown}, now)
-    _note_inputs(tx, mission_id, changes)
+    _note_inputs(tx, mission_id, row.revision, changes)
     _clean(tx, mission_id, rendered)
     fuse_frames(tx, mission_id, now)
     return row.revision
@@ -370,12 +370,25 @@ def _flip(tx: Session, mission_id: str, revision: int, news: Sequence[Render]) -
     tx.execute(upsert, tiles)
 
 
-def _note_inputs(tx: Session, mission_id: str, changes: Collection[Render]) -> None:
-    """Also a picture that is no news may have been drawn from other poses than the one shown."""
+def _note_inputs(tx: Session, mission_id: str, revision: int, changes: Collection[Render]) -> None:
+    """Also of pictures that are no news, and of tiles that are empty as they were."""
     tile = table(Tile)
-    rows = [_tile_params(mission_id, r.key) | {"drawn_from": r.inputs} for r in changes]
+    parts = [_tile_params(mission_id, r.key) for r in changes if r.inputs is None]
+    if parts:
+        tx.execute(update(tile).where(_is_tile(tile)).values(inputs=None), parts)
+    rows = [
+        {"mission_id": mission_id, "z": r.key[0], "x": r.key[1], "y": r.key[2], "inputs": r.inputs}
+        | {"revision": revision, "generation": r.generation, "size_bytes": 0}
+        for r in changes
+        if r.inputs is not None
+    ]
     if rows:
-        tx.execute(update(tile).where(_is_tile(tile)).values(inputs=bindparam("drawn_from")), rows)
+        upsert = insert(tx, Tile)
+        keys = ["mission_id", "z", "x", "y"]
+        update_ = upsert.on_conflict_do_update(
+            index_elements=keys, set_={"inputs": upsert.excluded["inputs"]}
+        )
+        tx.execute(update_, rows)
 
 
 def _clean(tx: Session, mission_id: str, rendered: Collection[Render]) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
 import pytest
+import simplejpeg
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -74,3 +76,46 @@ def test_a_stage_goes_on_in_this_process_when_it_serves_the_next_one(
     app.go_on("sequence", "mission")
     assert done == [("mission", "frame")]
     assert sent == [("sequence", "mission")]
+
+
+class _Album:
+    """An object store of 5,000 small photos; ten pictures, again and again."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        pictures = rng.integers(0, 256, (10, 6, 8, 3)).astype(np.uint8).repeat(16, 1).repeat(16, 2)
+        self.photos = [
+            simplejpeg.encode_jpeg(np.ascontiguousarray(p), quality=85, colorspace="RGB") for p in pictures
+        ]
+        self.tile = _tile(1, hole=False)
+
+    def get(self, key: str) -> bytes:
+        return self.tile if "/tiles/" in key else self.photos[int(key.rsplit("/", 1)[1]) % 10]
+
+
+@pytest.mark.usefixtures("modules")
+def test_five_thousand_frames_and_their_tiles_stay_within_the_settings() -> None:
+    """What Python really holds, as tracemalloc counts it; on the way that the stages take."""
+    from workers.photos import MissionPhotos, PhotoShelf
+    from workers.pictures import Pictures
+
+    photo_bytes, tile_bytes = 4_000_000, 12_000_000
+    store = _Album()
+    shelf = PhotoShelf.of(store, photo_bytes)
+    pictures = Pictures(store, tile_bytes)
+    mission = MissionPhotos(shelf, "m", None)
+    tracemalloc.start()
+    before, most = tracemalloc.get_traced_memory()[0], 0
+    for k in range(5000):
+        for frame in (k, max(k - 1, 0), max(k - 30, 0)):
+            assert mission.photo(str(frame)).shape == (96, 128, 3)
+        if k % 10 == 0:
+            pictures.get(f"m/tiles/{k}")
+        if k % 50 == 49:
+            most = max(most, tracemalloc.get_traced_memory()[0] - before)
+    tracemalloc.stop()
+    assert shelf.pictures.held_bytes <= photo_bytes
+    assert pictures.held.held_bytes <= tile_bytes
+    # A sixteenth each for features and thumbnails, two for words: here only photos and tiles are held.
+    limit = photo_bytes * 12 / 16 + tile_bytes
+    assert 0.9 * limit <= most <= 1.1 * limit

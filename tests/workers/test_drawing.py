@@ -1,0 +1,106 @@
+"""What drawing costs: a live map fills its holes, rest or the end draws all once, nothing is drawn twice."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from services.catalog import frames, missions
+from services.report import report
+from services.tables import Tile
+
+Photos = list[tuple[str, bytes]]
+
+
+def pixels(bench: Any) -> dict[str, Any]:
+    with bench.db.read() as tx:
+        return report(tx, bench.mission_id)["pixels"]
+
+
+def in_parts(bench: Any) -> int:
+    """How many native tiles were drawn in parts, from several poses of the same photos."""
+    with bench.db.read() as tx:
+        row = missions.get(tx, bench.mission_id)
+        tiles = tx.query(Tile).filter_by(mission_id=bench.mission_id, z=row.zoom).all()
+    assert tiles
+    return sum(tile.inputs is None for tile in tiles)
+
+
+@pytest.fixture
+def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if no photo had come for a long time."""
+    monkeypatch.setattr(frames, "quiet_s", lambda *_: math.inf)
+
+
+def test_a_mission_whose_photos_come_one_by_one_renders_less_than_two_passes(
+    bench: Any, photos: Photos, expected: dict[tuple[int, int, int], bytes]
+) -> None:
+    for photo in photos:
+        bench.upload([photo])
+        bench.drain()
+    live = pixels(bench)
+    bench.finalise()
+    bench.drain()
+    cost = pixels(bench)
+    assert live["rendered"] > 0
+    last = cost["by_kind"]["final"]
+    assert cost["one_pass"] <= last <= 1.2 * cost["one_pass"]  # tiles that the live poses led to besides
+    assert cost["rendered"] == live["rendered"] + last
+    assert cost["ratio"] <= 2.0
+    assert in_parts(bench) == 0
+    assert bench.tiles() == expected
+
+
+def test_a_map_at_rest_is_what_finalising_makes_of_it_also_by_another_sequencer(
+    bench: Any, photos: Photos, expected: dict[tuple[int, int, int], bytes], quiet: None
+) -> None:
+    sequence = bench.modules["sequence"]
+    with pytest.MonkeyPatch.context() as flying:
+        flying.setattr(frames, "quiet_s", lambda *_: 0.0)
+        for photo in photos:
+            bench.upload([photo])
+            bench.drain()
+    assert in_parts(bench) > 0
+    sequence._known.clear()  # the one that posed them was killed
+    with bench.db.write() as tx:
+        for wake in missions.stalled(tx, 30.0, now=4e9):
+            if wake.args[0] == bench.mission_id:
+                bench.send(wake.task, *wake.args)
+    bench.drain()
+    assert bench.state == "open"
+    assert in_parts(bench) == 0
+    assert bench.tiles() == expected
+    before = pixels(bench)
+    bench.finalise()
+    bench.drain()
+    assert bench.state == "final"
+    assert bench.tiles() == expected
+    assert pixels(bench) == before  # nothing was left to draw
+
+
+def test_a_map_at_rest_is_left_alone(bench: Any, photos: Photos, quiet: None) -> None:
+    bench.upload(photos[:4])
+    bench.drain()
+    with bench.db.read() as tx:
+        before = missions.get(tx, bench.mission_id)
+    bench.send("sequence", bench.mission_id)
+    bench.drain()
+    with bench.db.read() as tx:
+        after = missions.get(tx, bench.mission_id)
+    assert (after.generation, after.revision) == (before.generation, before.revision)
+
+
+def test_another_finalising_of_the_same_photos_draws_nothing(bench: Any, photos: Photos) -> None:
+    bench.upload(photos[:5])
+    bench.finalise()
+    bench.drain()
+    before = pixels(bench)
+    with bench.db.write() as tx:
+        row = missions.get(tx, bench.mission_id)
+        row.state, row.final_generation = "open", None
+    bench.finalise()
+    bench.drain()
+    assert bench.state == "final"
+    assert pixels(bench) == before
