@@ -27,6 +27,8 @@ Flat8 = NDArray[np.uint8]
 Row = NDArray[np.float32]
 
 NOBODY = -1
+OTHER_GROUND = 0.03
+"""How much a difference of mean tone says, beside one of detail, that photos do not show the same."""
 
 
 class Layer(NamedTuple):
@@ -152,7 +154,14 @@ def _retone(
                     r = detail[k, y, x, 0] - detail[winner, y, x, 0]
                     g = detail[k, y, x, 1] - detail[winner, y, x, 1]
                     b = detail[k, y, x, 2] - detail[winner, y, x, 2]
-                    say = weights[k, y, x] * scale / (scale + (r * r + g * g + b * b) / 3)
+                    apart = (r * r + g * g + b * b) / 3
+                    r, g, b = (
+                        even[k, y, x, 0] - here[0],
+                        even[k, y, x, 1] - here[1],
+                        even[k, y, x, 2] - here[2],
+                    )
+                    apart += (r * r + g * g + b * b) / 3 * OTHER_GROUND
+                    say = weights[k, y, x] * scale / (scale + apart)
                     total += say
                     red += say * (even[k, y, x, 0] - here[0])
                     green += say * (even[k, y, x, 1] - here[1])

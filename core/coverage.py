@@ -62,7 +62,7 @@ def tiles_under(frame: PosedFrame, world: World, zoom: int, params: FusionParams
     outline = ground_outline(frame)
     if outline is None:
         return set()
-    return tiles_of(world, outline, frame.pose.ground_h_m, zoom, params.reach_px)
+    return tiles_of(world, outline, frame.pose.ground_h_m, zoom, params.touch_px)
 
 
 def outline_px(frame: PosedFrame, world: World, zoom: int) -> Array | None:

@@ -29,7 +29,8 @@ from core.blend import (
 )
 from core.geometry import Array, PosedFrame, World
 from core.grid import Grid
-from core.warp import Int32, Lattice, Rgb, View, knots, look, warp
+from core.seams import REACH_CELLS, settle
+from core.warp import Int32, Lattice, Rgb, Views, knots, look, warp
 
 PAD_CELLS = 2
 """The pyramid looks this many cells beyond a pixel, however many bands there are."""
@@ -56,7 +57,8 @@ class FusionParams:
     `bands`: Laplacian bands above the lowest; cells are 2^bands pixels. `tone_side_px`: photos are shrunk to
     this before their tones are averaged; photos whose detail differs by more than `tone_tolerance` grey
     levels are left out, lest they leave ghosts. `max_view_deg`: rays flatter than this from the vertical are
-    not drawn. `gnss_importance`: weight of frames without a visual pose.
+    not drawn. `gnss_importance`: weight of frames without a visual pose. `seams`: whether they are led around
+    what photos disagree about; where not, the heaviest photo wins.
     """
 
     bands: int = 4
@@ -65,6 +67,7 @@ class FusionParams:
     max_view_deg: float = 75.0
     gnss_importance: float = 0.25
     sampling: Literal["linear", "cubic"] = "linear"
+    seams: bool = True
 
     @property
     def cell_px(self) -> int:
@@ -72,9 +75,19 @@ class FusionParams:
         return 1 << self.bands
 
     @property
-    def reach_px(self) -> int:
-        """No frame changes a pixel farther than this outside of its footprint: the margin for dirty tiles."""
+    def rim_cells(self) -> int:
+        """So many cells more are looked at, to know where seams run."""
+        return REACH_CELLS + 2 if self.seams else 0
+
+    @property
+    def touch_px(self) -> int:
+        """No frame is mixed into pixels farther than this outside of its footprint."""
         return (PAD_CELLS + SKIRT_CELLS + 1) * self.cell_px
+
+    @property
+    def reach_px(self) -> int:
+        """No frame changes a pixel, not even by moving others' seams, farther than this outside of it."""
+        return self.touch_px + self.rim_cells * self.cell_px
 
 
 DEFAULT = FusionParams()
@@ -126,10 +139,11 @@ def render(
     """
     out = np.zeros((grid.height, grid.width, 4), np.uint8)
     frames = sorted(frames, key=lambda f: f.frame_id)
-    lattice = Lattice.covering(grid, world, params.cell_px, PAD_CELLS)
-    scene = _Scene.of(lattice, grid.resolution_m(world), frames, photos, params, _kept(only))
+    wide = Lattice.covering(grid, world, params.cell_px, PAD_CELLS + params.rim_cells)
+    scene = _Scene.of(wide, grid.resolution_m(world), frames, photos, params, _kept(only))
     if scene is None:
         return out
+    lattice = wide.inner(params.rim_cells)
     drawn = _draw(scene, lattice, grid.resolution_m(world), photos, params)
     top, left = grid.row0 - lattice.row0, grid.col0 - lattice.col0
     out[:] = drawn[top : top + grid.height, left : left + grid.width]
@@ -146,7 +160,7 @@ def _kept(only: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
 
 @dataclass(frozen=True, slots=True)
 class _Scene:
-    """Who wins where on a lattice. `frames`: the winners only, `labels` and `weights` index into them."""
+    """Who wins where on a lattice's inner knots. `frames`: the winners only, which the rest index into."""
 
     frames: list[PosedFrame]
     labels: Labels
@@ -164,42 +178,47 @@ class _Scene:
         kept: NDArray[np.bool_] | None = None,
     ) -> _Scene | None:
         """The winners among frames by ascending id (ties go to the lower); None when nobody sees it."""
-        views = [_view(lattice, resolution_m, frame, photos, params) for frame in frames]
-        seen = [k for k, view in enumerate(views) if view.weight.any()]
-        if not seen:
-            return None
-        weights = np.stack([views[k].weight for k in seen])
-        drawn = weights.any(0) if kept is None else weights.any(0) & kept
+        rim = params.rim_cells
+        views = Views.empty(len(frames), lattice, rim)
+        for k, frame in enumerate(frames):
+            _look(views, k, lattice, resolution_m, frame, photos, params)
+        inner = np.s_[:, rim : lattice.rows - rim, rim : lattice.cols - rim]
+        given = np.ascontiguousarray(views.weight[inner])
+        drawn = given.any(0) if kept is None else given.any(0) & kept
         if not drawn.any():
             return None
+        weights = settle(views.weight, views.spot)[inner] if params.seams else given
         labels = np.where(drawn, weights.argmax(0), NOBODY).astype(np.int16)
-        tones = Tones(
-            np.stack([views[k].own for k in seen]),
-            np.stack([views[k].even for k in seen]),
-            np.stack([views[k].detail for k in seen]),
-        )
         winners = np.unique(labels[labels != NOBODY])
-        place = np.full(len(seen) + 1, NOBODY, np.int16)
+        place = np.full(len(frames) + 1, NOBODY, np.int16)
         place[winners] = np.arange(len(winners))
         return cls(
-            frames=[frames[seen[k]] for k in winners],
+            frames=[frames[k] for k in winners],
             labels=place[labels],
             weights=np.ascontiguousarray(weights[winners]),
-            retone=retone(labels, weights, tones, params.tone_tolerance),
+            retone=retone(labels, given, Tones(views.own, views.even, views.detail), params.tone_tolerance),
         )
 
 
-def _view(
-    lattice: Lattice, resolution_m: float, frame: PosedFrame, photos: Photos, params: FusionParams
-) -> View:
+def _look(
+    views: Views,
+    k: int,
+    lattice: Lattice,
+    resolution_m: float,
+    frame: PosedFrame,
+    photos: Photos,
+    params: FusionParams,
+) -> None:
     gsd_m = abs(frame.pose.gsd_m(frame.camera))
     importance = min(1.0, resolution_m / gsd_m)
     if frame.pose.source == "gnss":
         importance *= params.gnss_importance
     skirt_px = SKIRT_CELLS * params.cell_px * resolution_m / gsd_m
-    tone = _shrunk(photos.thumb(frame.frame_id), params.tone_side_px)
-    tones = (tone, _shrunk(tone, params.tone_side_px // 4))
-    return look(lattice, frame, tones, importance, math.cos(math.radians(params.max_view_deg)), skirt_px)
+    thumb = photos.thumb(frame.frame_id)
+    tone = _shrunk(thumb, params.tone_side_px)
+    tones = (thumb, tone, _shrunk(tone, params.tone_side_px // 4))
+    min_cos_view = math.cos(math.radians(params.max_view_deg))
+    look(lattice, frame, tones, importance, min_cos_view, skirt_px, views, k)
 
 
 def _shrunk(image: Rgb, side_px: int) -> Rgb:

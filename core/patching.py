@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,6 +27,9 @@ FADE_PX = 16
 
 Mask = NDArray[np.bool_]
 
+LIVE = replace(FUSION, seams=False)
+"""Parts are on their way only: what they cut in two is whole again in the final map."""
+
 
 @dataclass(frozen=True, slots=True)
 class Patched:
@@ -41,7 +44,7 @@ def fill_block(
     world: World,
     frames: FrameIndex,
     photos: Photos,
-    params: FusionParams = FUSION,
+    params: FusionParams = LIVE,
 ) -> Patched:
     """Draws what these neighbouring tiles of one zoom do not show yet. `shown`: their pictures so far."""
     grid = block_grid(list(shown))

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ParamSpec, TypeVar, cast
+from typing import NamedTuple, ParamSpec, TypeVar, cast
 
 import cv2
 import numba
@@ -51,6 +51,20 @@ class Lattice:
     cell_px: int
     columns: Columns
 
+    def inner(self, rim: int) -> Lattice:
+        """The same without the `rim` outermost knots on each side."""
+        part = np.s_[rim : self.rows - rim, rim : self.cols - rim]
+        foot, slope = (v.reshape(self.rows, self.cols, 2)[part].reshape(-1, 2) for v in self.columns)
+        shift = rim * self.cell_px
+        return Lattice(
+            self.col0 + shift,
+            self.row0 + shift,
+            self.cols - 2 * rim,
+            self.rows - 2 * rim,
+            self.cell_px,
+            Columns(np.ascontiguousarray(foot), np.ascontiguousarray(slope)),
+        )
+
     @classmethod
     def covering(cls, grid: Grid, world: World, cell_px: int, pad: int) -> Lattice:
         """The knots of every cell that the grid touches, and of `pad` cells more on each side."""
@@ -66,19 +80,33 @@ class Lattice:
         return cls(left * cell_px, top * cell_px, cols, rows, cell_px, columns)
 
 
-@dataclass(frozen=True, slots=True)
-class View:
-    """One frame seen from the lattice.
+class Views(NamedTuple):
+    """Frames seen from the lattice, (frames, rows, cols); `own`, `even`, `detail` of its inner knots only.
 
-    `weight`: (rows, cols) int32, 0 where the frame has no say, `INSIDE` … `FULL` inside of its photo.
-    `own`: (rows, cols, 3) int16, the photo's local mean colour in 1/16 grey levels, gain applied. `even`: the
-    same, relieved of the lens's falloff too. `detail`: how `own` departs from a much coarser mean.
+    `weight`: int32, 0 where the frame has no say, `INSIDE` … `FULL` inside of its photo. `spot`: (…, 3) int16
+    in 1/16 grey levels, gain applied: how the colours of the smallest things that a knot can tell depart from
+    a much coarser mean. `own`: the photo's local mean colour. `even`: the same without the lens's falloff.
+    `detail`: how `own` departs from that much coarser mean.
     """
 
     weight: Int32
+    spot: Int16
     own: Int16
     even: Int16
     detail: Int16
+
+    @classmethod
+    def empty(cls, frames: int, lattice: Lattice, rim: int) -> Views:
+        """Nobody sees anything yet; the `rim` outer knots on each side of the lattice are not inner ones."""
+        wide, inner = (
+            (frames, lattice.rows, lattice.cols),
+            (frames, lattice.rows - 2 * rim, lattice.cols - 2 * rim),
+        )
+        return cls(
+            np.zeros(wide, np.int32),
+            np.zeros((*wide, 3), np.int16),
+            *(np.zeros((*inner, 3), np.int16) for _ in range(3)),
+        )
 
 
 @lru_cache(maxsize=256)
@@ -103,19 +131,18 @@ def intrinsics(camera: Camera) -> NDArray[np.float64]:
 def look(
     lattice: Lattice,
     frame: PosedFrame,
-    tones: tuple[Rgb, Rgb],
+    tones: tuple[Rgb, Rgb, Rgb],
     importance: float,
     min_cos_view: float,
     skirt_px: float,
-) -> View:
-    """Weights and tones of one frame at all knots.
+    views: Views,
+    k: int,
+) -> None:
+    """Weights and tones of one frame at all knots, into the k-th of `views`.
 
-    `tones`: the photo shrunk to a few pixels, and to fewer still, (h, w, 3) uint8. `importance`: 0 … 1,
+    `tones`: the photo shrunk, to a few pixels, and to fewer still, (h, w, 3) uint8. `importance`: 0 … 1,
     multiplies the weight. `skirt_px`: how far beyond the photo's edge weights fade out, in its own pixels.
     """
-    weight = np.zeros((lattice.rows, lattice.cols), np.int32)
-    own = np.zeros((lattice.rows, lattice.cols, 3), np.int16)
-    light, detail = np.zeros_like(own), np.zeros_like(own)
     pose = frame.pose
     _look(
         lattice.columns.foot,
@@ -127,16 +154,9 @@ def look(
         *tones,
         np.array([round(16 * 256 * g) for g in frame.gain], np.int64),
         np.array(frame.camera.falloff or (0.0,) * 9),
-        importance,
-        min_cos_view,
-        skirt_px,
-        _reach_m(frame, skirt_px),
-        weight.reshape(-1),
-        own.reshape(-1, 3),
-        light.reshape(-1, 3),
-        detail.reshape(-1, 3),
+        np.array([importance, min_cos_view, skirt_px, _reach_m(frame, skirt_px)]),
+        *(column[k] for column in views),
     )
-    return View(weight, own, light, detail)
 
 
 def _reach_m(frame: PosedFrame, skirt_px: float) -> float:
@@ -235,15 +255,16 @@ def _knots(
 
 
 @compiled
-def _sample(image: Rgb, right: float, down: float, c: int) -> int:
-    """One channel, bilinear, at shares (0 … 1) of the picture's width and height; in 1/65536 grey levels."""
+def _sample(image: Rgb, right: float, down: float, gain: NDArray[np.int64], out: NDArray[np.int64]) -> None:
+    """Bilinear, times gain, at shares (0 … 1) of the picture's width and height; in 1/16 grey levels."""
     x = min(max(right * image.shape[1] - 0.5, 0.0), image.shape[1] - 1.0)
     y = min(max(down * image.shape[0] - 0.5, 0.0), image.shape[0] - 1.0)
     x0, y0 = min(int(x), image.shape[1] - 2), min(int(y), image.shape[0] - 2)
     fx, fy = int((x - x0) * 256 + 0.5), int((y - y0) * 256 + 0.5)
-    upper = int(image[y0, x0, c]) * (256 - fx) + int(image[y0, x0 + 1, c]) * fx
-    lower = int(image[y0 + 1, x0, c]) * (256 - fx) + int(image[y0 + 1, x0 + 1, c]) * fx
-    return upper * (256 - fy) + lower * fy
+    for c in range(3):
+        upper = int(image[y0, x0, c]) * (256 - fx) + int(image[y0, x0 + 1, c]) * fx
+        lower = int(image[y0 + 1, x0, c]) * (256 - fx) + int(image[y0 + 1, x0 + 1, c]) * fx
+        out[c] = ((upper * (256 - fy) + lower * fy) * gain[c] + (1 << 23)) >> 24
 
 
 @compiled
@@ -254,21 +275,23 @@ def _look(
     center: NDArray[np.float64],
     h_m: float,
     lens: NDArray[np.float64],
+    sharp: Rgb,
     fine: Rgb,
     coarse: Rgb,
     gain: NDArray[np.int64],
     falloff: NDArray[np.float64],
-    importance: float,
-    min_cos_view: float,
-    skirt_px: float,
-    reach_m: float,
+    limits: NDArray[np.float64],
     weight: Int32,
+    spot: Int16,
     own: Int16,
     light: Int16,
     detail: Int16,
 ) -> None:
+    importance, min_cos_view, skirt_px, reach_m = limits
     width, height = lens[6], lens[7]
     bare = not falloff.any()
+    cols, rim = weight.shape[1], (weight.shape[1] - own.shape[1]) // 2
+    least, value, around = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
     for k in range(foot.shape[0]):
         x, y = foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m
         if (x - center[0]) ** 2 + (y - center[1]) ** 2 > reach_m * reach_m:
@@ -280,22 +303,29 @@ def _look(
         beyond = max(max(-u, u - (width - 1)), max(-v, v - (height - 1))) / (cos_view * cos_view)
         if beyond >= skirt_px:
             continue
+        j, i = k // cols, k % cols
         if beyond > 0:
-            weight[k] = int((INSIDE - 1) * (1 - beyond / skirt_px))
+            weight[j, i] = int((INSIDE - 1) * (1 - beyond / skirt_px))
         else:
             across, along = 2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1
-            value = (1 - across * across) * (1 - along * along) * cos_view * cos_view * cos_view * cos_view
-            weight[k] = INSIDE + int((FULL - INSIDE) * importance * value)
+            share = (1 - across * across) * (1 - along * along) * cos_view * cos_view * cos_view * cos_view
+            weight[j, i] = INSIDE + int((FULL - INSIDE) * importance * share)
         right, down = (u + 0.5) / width, (v + 0.5) / height
+        _sample(sharp, right, down, gain, least)
+        _sample(coarse, right, down, gain, around)
+        for c in range(3):
+            spot[j, i, c] = min(max(least[c] - around[c], -16000), 16000)
+        j, i = j - rim, i - rim
+        if min(j, i) < 0 or j >= own.shape[0] or i >= own.shape[1]:
+            continue
+        _sample(fine, right, down, gain, value)
         rho2 = 4 * ((u - lens[1]) ** 2 + (v - lens[2]) ** 2) / (width * width + height * height)
         for c in range(3):
-            value = (_sample(fine, right, down, c) * gain[c] + (1 << 23)) >> 24
-            around = (_sample(coarse, right, down, c) * gain[c] + (1 << 23)) >> 24
-            own[k, c] = light[k, c] = min(value, 16000)
-            detail[k, c] = min(max(value - around, -16000), 16000)
+            own[j, i, c] = light[j, i, c] = min(value[c], 16000)
+            detail[j, i, c] = min(max(value[c] - around[c], -16000), 16000)
             if not bare:
                 dim = rho2 * (falloff[3 * c] + rho2 * (falloff[3 * c + 1] + rho2 * falloff[3 * c + 2]))
-                light[k, c] = min(math.floor(value * math.exp(-dim) + 0.5), 16000)
+                light[j, i, c] = min(math.floor(value[c] * math.exp(-dim) + 0.5), 16000)
 
 
 @compiled

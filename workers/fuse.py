@@ -57,10 +57,10 @@ def _fuse_block(mission_id: str, claimed: Sequence[TileKey], clock: Stopwatch) -
 
 
 def _box(mission: Mission, block: Sequence[Key]) -> TileBox:
-    """The tiles around the block among those by which poses are found."""
+    """The tiles around the block among those by which poses are found: next to it frames move its seams."""
     finer = max(0, block[0][0] - (mission.zoom or 0))
     xs, ys = [x >> finer for _, x, _ in block], [y >> finer for _, _, y in block]
-    return TileBox(block[0][0] - finer, min(xs), min(ys), max(xs), max(ys))
+    return TileBox(block[0][0] - finer, min(xs) - 1, min(ys) - 1, max(xs) + 1, max(ys) + 1)
 
 
 def near(known: Poses, zoom: int | None) -> Poses:
@@ -99,11 +99,11 @@ def _redrawn(
 ) -> tuple[list[Render], int]:
     """The tiles drawn as a whole, but for those that show what they were drawn from already."""
     assert known.world is not None
-    frames = [p.posed(known.cameras) for p in known.placed.values()]
-    digests = {f.frame_id: frame_digest(f) for f in frames}
+    index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], FUSION)
+    digests = {f.frame_id: frame_digest(f) for f in index.frames}
     done, inputs = [], dict[TileKey, str]()
     for tile in block:
-        near = [digests[k] for k, p in known.placed.items() if _touches(p.box, tile)]
+        near = [digests[f.frame_id] for f in index.overlapping(block_grid([tile]), known.world)]
         inputs[tile] = tile_inputs(tile, known.world, mission.tile_side, near, FUSION)
         shown = wanted[tile].shown
         if shown is not None and shown.inputs == inputs[tile]:
@@ -112,14 +112,10 @@ def _redrawn(
     if not left:
         return done, 0
     photos = MissionPhotos(shelf, mission.id, mission.tile_side)
-    found = draw_block(left, known.world, FrameIndex(frames, FUSION), photos)
+    found = draw_block(left, known.world, index, photos)
     made = [put_tile(store, mission.id, wanted[t].generation, t, p, inputs[t]) for t, p in found.items()]
     grid = block_grid(left)
     return [*done, *made], grid.width * grid.height
-
-
-def _touches(box: TileBox, tile: TileKey) -> bool:
-    return box.z == tile.z and box.x0 <= tile.x <= box.x1 and box.y0 <= tile.y <= box.y1
 
 
 def _filled(

@@ -219,6 +219,7 @@ def test_the_order_of_the_frames_does_not_matter(flown: tuple[list[PosedFrame], 
 def test_only_photos_that_win_are_read(flown: tuple[list[PosedFrame], Album]) -> None:
     frames, album = flown
     grid = middle(128, 128)
+    grid = grid.window(grid.col0 - 400, grid.row0 - 320, 128, 128)
     album.reads.clear()
     render(grid, WORLD, frames, album)
     seen = overlapping(grid, WORLD, frames)
