@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 
@@ -59,5 +60,10 @@ def _yaw(s: Survey, k: int, yaw: float, offset: Array) -> float:
 
 def is_oblique(pose: Pose, camera: Camera, ratio: float) -> bool:
     """Whether a corner of the picture shows the sky, or ground further away than `ratio` times the height."""
-    ray = camera.rays(camera.corners()) @ pose.world_R_cam.T
+    ray = _corner_rays(camera) @ pose.world_R_cam.T
     return bool((ray[:, 2] >= 0).any() or (np.hypot(ray[:, 0], ray[:, 1]) > -ratio * ray[:, 2]).any())
+
+
+@lru_cache(maxsize=64)
+def _corner_rays(camera: Camera) -> Array:
+    return camera.rays(camera.corners())

@@ -58,10 +58,9 @@ def covariances(factor: Factor, n: int) -> Array:
         whole = _block(L, W, rest)
         if unasked[k]:
             inverse[k] = whole
-        for a, node in enumerate(front.nodes[: front.pivots].tolist()):
-            half = np.tril(whole[a * d : (a + 1) * d, a * d : (a + 1) * d])
-            out[node] = half + np.tril(half, -1).T
-    return out
+        at = d * np.arange(front.pivots)[:, None, None] + np.arange(d)
+        out[front.nodes[: front.pivots]] = whole[at.transpose(0, 2, 1), at]
+    return np.tril(out) + np.tril(out, -1).transpose(0, 2, 1)
 
 
 def _block(L: Array, W: Array, rest: Array) -> Array:
