@@ -17,9 +17,8 @@ def upgrade() -> None:
     op.add_column("missions", sa.Column("healed_generation", sa.Integer(), nullable=True))
     op.add_column("missions", sa.Column("pass_pixels", sa.BigInteger(), nullable=True))
     op.add_column("missions", sa.Column("pixels", sa.JSON(), nullable=False, server_default="{}"))
-    flag = {"nullable": False, "server_default": sa.false()}
-    op.add_column("missions", sa.Column("backfill", sa.Boolean(), **flag))
-    op.add_column("missions", sa.Column("full", sa.Boolean(), **flag))
+    for flag in ("backfill", "full"):
+        op.add_column("missions", sa.Column(flag, sa.Boolean(), nullable=False, server_default=sa.false()))
     op.add_column("missions", sa.Column("sharp_zoom", sa.Integer(), nullable=True))
     op.add_column("missions", sa.Column("sharp_tiles", sa.Integer(), nullable=True))
 
