@@ -1,8 +1,8 @@
 """What the global solve costs on one thread: python -m tests.bench.solver [photos …]
 
-Simulated flights with 2 m GPS noise whose correspondences are projected ground points, `--pairs` matched pairs
-a photo. One line of JSON a flight: CPU seconds of the best of some runs, sigmas included; the process's peak
-memory; errors against the truth.
+Simulated flights with 2 m GPS noise whose correspondences are projected ground points, with `--pairs` matched
+pairs a photo. One line of JSON a flight: CPU seconds of the best of some runs, sigmas included; the peak
+memory of the process; errors against the truth.
 """
 
 from __future__ import annotations

@@ -83,6 +83,19 @@ def test_a_perfect_match_costs_nothing_and_pulls_nowhere(state: State) -> None:
     assert np.abs(normal.frame_rhs).max() < 1e-4
 
 
+def test_a_focal_length_that_heights_follow_changes_no_residual(state: State) -> None:
+    """Level cameras at one height cannot tell one from the other, however long the step."""
+    level = np.tile(np.diag((1.0, -1.0, -1.0)), (2, 1, 1))
+    t = state.t * (1, 1, 0) + (0, 0, 60)
+    flat = State(level, t, np.ones(2), np.array([[1200.0, 0, 0], [900.0, 0, 0]]), state.lag_s)
+    edges = edges_between(np.random.default_rng(2).uniform(-300, 300, (20, 4)), (0, 1))
+    frames, border = np.zeros((2, 7)), np.zeros(7)
+    border[[0, 3]] = -0.4
+    frames[:, 6] = 0.4 * (flat.t[:, 2] - flat.h)
+    before, after = (linearise(edges, s, np.ones(2), 2.0) for s in (flat, retract(flat, frames, border)))
+    np.testing.assert_allclose(after.squared, before.squared, rtol=1e-9)
+
+
 def test_a_ray_above_the_horizon_is_refused(state: State) -> None:
     up = State(state.R @ rotations(np.full((2, 3), 1.5)), state.t, state.h, state.lens, state.lag_s)
     normal = linearise(edges_between(np.zeros((1, 4))), up, np.ones(2), 2.0)
