@@ -43,7 +43,7 @@ LIVE_TILES, PAIRS_PER_TASK = 12, 24
 WORTH_A_LOOK = 24
 """While so many photos still wait to be read, a mission that is being finished grows live as well."""
 REST_S = 4.0
-"""Pause between live renders while photos wait to be read: the map grows, and takes little from reading."""
+"""Pause between batches of the live map while photos wait to be read: it grows, and takes little from reading."""
 _REMEMBERED = 8
 IDLE = Backlog(0, 0, 0, 0, 0)
 
@@ -86,7 +86,7 @@ def _waits(mission_id: str) -> bool:
     if mission.state == "finalising" and not desk.unread and _pairs_missing(mission_id):
         return False
     resting = desk.unread > settings.workers and time.monotonic() < _rested.get(mission_id, 0.0)
-    return not (resting and mission.state == "finalising")
+    return not resting
 
 
 def _pairs_missing(mission_id: str) -> bool:

@@ -19,7 +19,7 @@ from services.export_names import MOSAIC
 
 EXPORTS = ("poses.json", "report.json", "footprints.geojson", "route.csv", "tiles.pmtiles", MOSAIC)
 PARALLEL = 4
-POLL_S = 0.25
+POLL_S = 0.5
 STUCK_S = 900.0
 SHOWN = 20
 LOOK_AROUND_S = 10.0
@@ -79,6 +79,8 @@ class Screen:
             TextColumn("{task.fields[rate]}"),
             TimeRemainingColumn(compact=True),
             console=console,
+            # Drawn when there is news: a thread that redraws all the time takes from the cores that map.
+            auto_refresh=False,
         )
         self._total = total
         self._started = time.monotonic()
@@ -102,6 +104,7 @@ class Screen:
         for (_, bar), done in zip(self._bars.items(), (uploaded, matched, fused), strict=True):
             rate = f"{done / seconds:5.1f}/s" if done else ""
             self._progress.update(bar, completed=done, rate=rate)
+        self._progress.refresh()
 
 
 def upload_all(
