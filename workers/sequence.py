@@ -43,7 +43,7 @@ LIVE_TILES, PAIRS_PER_TASK = 12, 24
 WORTH_A_LOOK = 24
 """While so many photos still wait to be read, a mission that is being finished grows live as well."""
 REST_S = 4.0
-"""Pause between batches of the live map while photos wait to be read: it grows, and takes little from reading."""
+"""Pause between batches of the live map while photos wait to be read: it grows, and reading goes on."""
 _REMEMBERED = 8
 IDLE = Backlog(0, 0, 0, 0, 0)
 
