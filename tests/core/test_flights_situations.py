@@ -198,7 +198,27 @@ def test_gps_that_returns_places_the_map_even_when_a_fifth_of_it_is_wild(seed: i
     solution = wild.solved()
     assert one_map(wild, solution)
     assert fitted(*ground(wild, solution)).rms_m < 0.15
-    assert rms(ground_errors_m(wild, solution)) < 2 * gps_bound_m(m) + 0.8
+    assert rms(ground_errors_m(wild, solution)) < 2 * gps_bound_m(m) + 1.2
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_fix_that_states_centimetres_gives_centimetres(seed: int) -> None:
+    m, solution = flown(replace(BASE, rtk=True, gps_noise_m=0.02, tilt_deg=0.0, seed=seed))
+    assert one_map(m, solution)
+    assert rms(ground_errors_m(m, solution)) < 0.05
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_receivers_that_disagree_by_metres_do_not_tear_the_map(seed: int) -> None:
+    m, solution = flown(replace(BASE, drones=3, gps_bias_m=5.0, seed=seed))
+    assert one_map(m, solution)
+    assert fitted(*ground(m, solution)).rms_m < 0.1
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.5])
+def test_how_late_a_fix_is_is_found(lag_s: float) -> None:
+    found = [flown(replace(BASE, gps_lag_s=lag_s, seed=seed))[1].lag_s["drone 1"] for seed in SEEDS]
+    assert found == pytest.approx([lag_s] * len(found), abs=0.2)
 
 
 def test_a_map_without_gps_moves_into_place_when_gps_comes() -> None:
