@@ -30,16 +30,12 @@ SETTLED = 0.003
 @dataclass(frozen=True, slots=True)
 class Similarities:
     """Frames as similarities: `z` (N,) complex metres, `c` (N,) complex metres east + i·north; `error` (E,)
-    RMS disagreement of each pair as a share of the height above ground. `frame` (N, 2, 2) and `pair`
-    (E, 2, 2): the normal equations in (z, c) that they solve; `fix_weight` (N,) of GPS in them, 1/m².
+    RMS disagreement of each pair as a share of the height above ground.
     """
 
     z: ComplexArray
     c: ComplexArray
     error: Array
-    frame: ComplexArray
-    pair: ComplexArray
-    fix_weight: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +102,6 @@ def average(
     edge_weight, gps_weight = np.ones(len(pairs)), np.ones(n)
     height = np.full(n, height_m)
     x, error = np.zeros((n, 2), complex), np.zeros(len(pairs))
-    H, mixed, wg = np.zeros((n, 2, 2), complex), m.mixed, np.zeros(n)
     chained = np.isfinite(expected)
     trust = np.where(chained, 1 / (CHAINED * np.maximum(np.abs(expected), 1e-3)) ** 2, 0.0)
     for turn in range(ROUNDS):
@@ -118,8 +113,7 @@ def average(
         H[roots] += np.eye(2) * 1e3
         g = np.column_stack((np.where(chained, trust * expected, 0.0), np.where(known, wg * gps, 0.0)))
         g[roots, 0] += 1e3 * height_m
-        mixed = -w * m.mixed
-        solved = solve_hermitian(pairs, H, mixed, g)
+        solved = solve_hermitian(pairs, H, -w * m.mixed, g)
         if solved is None:
             break
         x, before = solved, error
@@ -135,7 +129,7 @@ def average(
             miss = np.abs(np.where(known, gps - x[:, 1], 0.0))
             scale = np.maximum(gps_sigma, 1.5 * np.median(miss[known])) * max(1.0, 3.0 * 0.6**turn)
             gps_weight = 1 / (1 + (miss / scale) ** 2)
-    return Similarities(x[:, 0], x[:, 1], error, H, mixed, wg)
+    return Similarities(x[:, 0], x[:, 1], error)
 
 
 def _pair_error(x: ComplexArray, i: IntArray, j: IntArray, m: Moments) -> Array:

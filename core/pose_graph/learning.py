@@ -8,9 +8,12 @@ from itertools import product
 import numpy as np
 
 from core.geometry import Array
+from core.pose_graph.matchgraph import submaps
 from core.pose_graph.model import PoseParams
 from core.pose_graph.priors import Priors, gravity, heading, nadir
+from core.pose_graph.receivers import receiver_biases
 from core.pose_graph.residuals import IntArray, State
+from core.pose_graph.sparse import number, plane
 from core.pose_graph.survey import Survey
 
 MIN_OPPOSITE = 10
@@ -19,9 +22,13 @@ MEDIAN_1D, MEDIAN_2D = 1.4826, 1.1774
 
 
 def learnt(s: Survey, pairs: IntArray, priors: Priors, state: State, params: PoseParams) -> Priors:
-    """Priors after the coarse adjustment: how good each drone's GPS is, and how its camera is mounted."""
+    """Priors after the coarse adjustment: by what and how widely each drone's GPS is off, and how its camera
+    is mounted.
+    """
     gps_sigma, altitude_sigma = priors.gps_sigma.copy(), priors.altitude_sigma.copy()
     miss = np.column_stack((nadir(priors, state)[0], state.t[:, 2])) - priors.gps
+    if len(s.drones) > 1:
+        priors, miss[:, :2] = _unbiased(s, pairs, priors, state, params)
     for d in range(len(s.drones)):
         mine = (s.drone == d) & s.has_gps
         if mine.sum() >= params.min_frames_to_learn:
@@ -38,6 +45,25 @@ def learnt(s: Survey, pairs: IntArray, priors: Priors, state: State, params: Pos
     return _mounted(
         s, pairs, replace(priors, gps_sigma=gps_sigma, altitude_sigma=altitude_sigma), state, params
     )
+
+
+def _unbiased(
+    s: Survey, pairs: IntArray, priors: Priors, state: State, params: PoseParams
+) -> tuple[Priors, Array]:
+    """Priors with each drone's fixes moved by what its receiver is off by; what is left of misses (N, 2)."""
+    own = [s.gps_sigma[(s.drone == d) & s.has_gps] for d in range(len(s.drones))]
+    typical = [float(np.median(sigma)) if len(sigma) else params.gps_sigma_m for sigma in own]
+    bias, left = receiver_biases(
+        number(nadir(priors, state)[0]),
+        number(priors.gps),
+        s.drone,
+        submaps(len(s), pairs, range(len(s))),
+        np.minimum(typical, params.gps_sigma_m),
+        float(np.median(state.t[:, 2] - state.h)),
+    )
+    moved = priors.gps.copy()
+    moved[:, :2] -= plane(bias[s.drone])
+    return replace(priors, gps=moved), plane(left)
 
 
 def _mounted(s: Survey, pairs: IntArray, priors: Priors, state: State, params: PoseParams) -> Priors:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from core.pose_graph.fixes import contradicted
 from core.pose_graph.matchgraph import flat_rays
 from core.pose_graph.model import PoseParams
 from core.pose_graph.priors import gravity
-from core.pose_graph.receivers import receiver_biases
 from core.pose_graph.residuals import Edges, IntArray, State
 from core.pose_graph.rotations import absolute_rotations, averaged_rotations
 from core.pose_graph.sparse import ComplexArray
@@ -100,10 +99,6 @@ def starting(s: Survey, edges: Edges, submap: IntArray, params: PoseParams) -> S
         chain = chained(edges.pairs, *ratios(m), roots, len(s))
     expected = np.where(whole[submap], np.nan, guess * chain)
     averaged = average(edges.pairs, m, gps, s.gps_sigma, fixed, guess, expected)
-    bias = receiver_biases(averaged, edges.pairs, gps, s.drone, _bias_priors(s, params))
-    if bias.any():
-        s = s.without_biases(bias)
-        averaged = average(edges.pairs, m, gps - bias[s.drone], s.gps_sigma, fixed, guess, expected)
     first = first_of_known_height(s, params)
     placed, offset = _georeferenced(s, averaged, submap, held, first, params)
     height, ground = _heights(s, placed, submap)
@@ -129,14 +124,6 @@ def _levelled(
     found = gravity(averaged_rotations(edges.pairs, views, absolute, np.array(roots, np.int64)))
     sane = np.einsum("ni,ni->n", found, down) > SANE_TILT
     return levelling(np.where(sane[:, None], found, down))
-
-
-def _bias_priors(s: Survey, params: PoseParams) -> Array:
-    """(D,) standard deviation of what each drone's receiver is off by, metres: that of its fixes."""
-    own = [s.gps_sigma[(s.drone == d) & s.has_gps] for d in range(len(s.drones))]
-    return np.array(
-        [min(float(np.median(v)), params.gps_sigma_m) if len(v) else params.gps_sigma_m for v in own]
-    )
 
 
 def _roots(pairs: IntArray, submap: IntArray) -> list[int]:
@@ -242,7 +229,7 @@ def _georeferenced(
             reach = 2.0 * float(np.median(np.abs(z[mine])))
             c[mine] += east - c[mine].real.min() - 1j * np.median(c[mine].imag)
             east = float(c[mine].real.max()) + reach
-    return replace(a, z=z, c=c), offset
+    return Similarities(z, c, a.error), offset
 
 
 def yaw_offsets(s: Survey, yaw: Array, trusted: NDArray[np.bool_]) -> Array:

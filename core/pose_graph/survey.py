@@ -65,11 +65,6 @@ class Survey:
         gps = np.where(bad[:, None], np.nan, self.gps)
         return replace(self, gps=gps, velocity=_velocities(self.frames, self.drone, gps))
 
-    def without_biases(self, bias: NDArray[np.complex128]) -> Survey:
-        """The survey with the fixes of each drone moved back by `bias` (D,), metres east + i·north."""
-        off = bias[self.drone]
-        return replace(self, gps=self.gps - np.column_stack((off.real, off.imag, np.zeros(len(self)))))
-
 
 _PER_FRAME = (
     "camera", "drone", "gps", "gps_sigma", "altitude_sigma", "velocity", "attitude", "relative_alt_m", "far",

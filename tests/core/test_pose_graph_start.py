@@ -13,16 +13,14 @@ from pyproj import Transformer
 
 from core.frame import Attitude, FrameMeta
 from core.matching import MatchCounts, PairMatch
-from core.pose_graph import GraphFrame, PoseParams, Solution, place, solve
+from core.pose_graph import GraphFrame, Solution, place, solve
 from core.pose_graph.attitude import circular_median, levelling, rotation_of
 from core.pose_graph.averaging import moments
 from core.pose_graph.chaining import spanned
 from core.pose_graph.fixes import contradicted
-from core.pose_graph.matchgraph import edges_of, submaps
+from core.pose_graph.receivers import receiver_biases
 from core.pose_graph.residuals import rotations
 from core.pose_graph.rotations import Absolute, absolute_rotations, angles, averaged_rotations, horn
-from core.pose_graph.start import starting
-from core.pose_graph.survey import Survey, survey
 from core.pose_graph.twoview import TwoViews, two_views
 from core.simulation import Flight, FlightParams, Shot, plan_flight
 
@@ -404,31 +402,38 @@ def test_receivers_that_differ_do_not_bend_the_map(seed: int) -> None:
         assert sigma_m < 1.25 * alike.gps_sigma_m[drone]
 
 
-def test_receivers_that_agree_are_left_alone() -> None:
-    for seed in range(3):
-        flight = flown(frames=60, drones=2, gps_noise_m=2.0, seed=seed)
-        rows, s = _starting(flight)
-        np.testing.assert_array_equal(s.gps, rows.gps)
+def blocks(noise_m: float, off_m: tuple[complex, ...], seed: int) -> tuple[np.ndarray, ...]:
+    """Places, fixes and drones of 50 frames a drone, side by side and overlapping."""
+    rng, drone = np.random.default_rng(seed), np.repeat(np.arange(len(off_m)), 50)
+    place = rng.uniform(0, 80, len(drone)) + 60 * drone + 1j * rng.uniform(0, 100, len(drone))
+    noise = rng.normal(0, noise_m, (len(drone), 2)) @ (1, 1j)
+    return place, 1.02 * np.exp(0.01j) * place + 7 - 3j + np.array(off_m)[drone] + noise, drone
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("off_m", [(4 + 0j, -4 + 0j), (3 + 1j, -2 + 1j, -1 - 2j)])
+def test_what_receivers_differ_by_is_found(off_m: tuple[complex, ...], seed: int) -> None:
+    place, gps, drone = blocks(0.3, off_m, seed)
+    alone = np.zeros(len(place), np.int64)
+    found, left = receiver_biases(place, gps, drone, alone, np.full(len(off_m), 3.0), 60.0)
+    assert np.abs(found - found.mean() - np.array(off_m) + np.mean(off_m)).max() < 0.8
+    assert np.median(np.abs(left)) < 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_receivers_that_agree_are_left_alone(seed: int) -> None:
+    place, gps, drone = blocks(2.0, (0j, 0j, 0j), seed)
+    alone = np.zeros(len(place), np.int64)
+    assert not receiver_biases(place, gps, drone, alone, np.full(3, 3.0), 60.0)[0].any()
+
+
+def test_drones_that_never_meet_are_left_alone() -> None:
+    place, gps, drone = blocks(0.3, (4 + 0j, -4 + 0j), 0)
+    assert not receiver_biases(place, gps, drone, drone, np.full(2, 3.0), 60.0)[0].any()
 
 
 def test_the_receiver_that_claims_less_gives_way() -> None:
-    flight = flown(frames=60, drones=2, gps_noise_m=0.05)
-
-    def surveyed(_: int, meta: FrameMeta) -> FrameMeta:
-        assert meta.gps
-        return replace(meta, gps=replace(meta.gps, sigma_h_m=0.05)) if meta.drone == "drone 1" else meta
-
-    told = differing(flight, 0.0, 4.0).claiming(surveyed)
-    before, after = _starting(told)
-    moved_m = np.abs(before.gps - after.gps).max(1)
-    own = after.drone == after.drones.index("drone 1")
-    assert moved_m[own].max() < 0.2
-    assert moved_m[~own].min() > 2.0
-
-
-def _starting(flight: Flown) -> tuple[Survey, Survey]:
-    """The survey as it was read, and as start values correct it."""
-    s = survey(flight.frames, PoseParams())
-    index = {f.frame_id: k for k, f in enumerate(s.frames)}
-    edges = edges_of(flight.matches, index, s.cameras, s.camera, PoseParams())
-    return s, starting(s, edges, submaps(len(s), edges.pairs, range(len(s))), PoseParams()).survey
+    place, gps, drone = blocks(0.3, (0j, 4 + 0j), 0)
+    found, _ = receiver_biases(place, gps, drone, np.zeros(100, np.int64), np.array([0.05, 3.0]), 60.0)
+    assert abs(found[0]) < 0.05
+    assert abs(found[1]) > 2.0
