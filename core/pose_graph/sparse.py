@@ -22,19 +22,19 @@ ComplexArray = NDArray[np.complex128]
 def solve_hermitian(
     pairs: IntArray, frame: ComplexArray, pair: ComplexArray, rhs: ComplexArray
 ) -> ComplexArray | None:
-    """The solution of H·x = `rhs` (N, d) or (N, d, k), in its shape; None where H is singular.
+    """The solution (N, d) of H·x = `rhs` (N, d); None where H is singular.
 
     `frame` (N, d, d): the diagonal blocks. `pair` (E, d, d): the block in the row of a pair's first frame and
     the column of its second; the other way round stands its conjugate transpose.
     """
-    n, d = rhs.shape[:2]
+    n, d = rhs.shape
     i, j, own = (k[:, None, None] * d for k in (pairs[:, 0], pairs[:, 1], np.arange(n)))
     row, col = np.arange(d)[:, None], np.arange(d)[None]
     parts = ((pair, i, j), (np.conj(pair.transpose(0, 2, 1)), j, i), (frame, own, own))
     values = np.concatenate([v.ravel() for v, _, _ in parts])
     rows = np.concatenate([np.broadcast_to(a + row, v.shape).ravel() for v, a, _ in parts])
     cols = np.concatenate([np.broadcast_to(b + col, v.shape).ravel() for v, _, b in parts])
-    x = _solved(coo_matrix((values, (rows, cols)), shape=(n * d, n * d)), rhs.reshape(n * d, -1))
+    x = _solved(coo_matrix((values, (rows, cols)), shape=(n * d, n * d)), rhs.reshape(-1, 1))
     return None if x is None else x.reshape(rhs.shape)
 
 

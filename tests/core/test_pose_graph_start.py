@@ -100,8 +100,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("which", BAD)
-@pytest.mark.parametrize("off_m", [300.0, 2_200.0, 30_000.0])
-@pytest.mark.parametrize("scattered", [False, True])
+@pytest.mark.parametrize(("off_m", "scattered"), [(300.0, False), (2_200.0, True), (30_000.0, False)])
 def test_a_fix_that_the_pictures_contradict_is_as_good_as_none(
     which: str, off_m: float, scattered: bool
 ) -> None:
