@@ -6,13 +6,15 @@ The border and the right-hand side ride along as the last rows of every front, s
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numba
 import numpy as np
-from scipy.linalg.blas import dsyrk, dtrsm, dtrsv
+from scipy.linalg import cython_blas
+from scipy.linalg.blas import dgemv, dsyrk, dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf
 
 from core.geometry import Array
@@ -80,6 +82,16 @@ def _hand_on(panel: Array, rest: Array, child: Array, at: IntArray, d: int) -> N
                 rest[to[p] - pivots, to[q] - pivots] += child[p, q]
 
 
+def _on_one_thread() -> None:
+    """Keep scipy's BLAS to one thread: how a sum is shared among threads changes how it rounds, and the same
+    photos are to give the same bits anywhere.
+    """
+    library = ctypes.CDLL(cython_blas.__file__)
+    if hasattr(library, "scipy_openblas_set_num_threads"):
+        library.scipy_openblas_set_num_threads(1)
+
+
+_on_one_thread()
 _compile: Callable[[Any], Any] = numba.njit(cache=True, nogil=True)
 _enter = _compile(_enter)
 _hand_on = _compile(_hand_on)
@@ -140,7 +152,8 @@ def solution(factor: Factor, n: int) -> tuple[Array, Array]:
     for k in range(len(factor.fronts) - 1, -1, -1):
         front, W = factor.fronts[k], factor.below[k]
         known = np.concatenate((x[front.nodes[front.pivots :]].ravel(), shared))
-        mine = dtrsv(factor.lower[k], W[-1] - known @ W[:-1], lower=1, trans=1)
+        y = dgemv(-1.0, W, np.append(known, -1.0), trans=1)
+        mine = dtrsv(factor.lower[k], y, lower=1, trans=1)
         x[front.nodes[: front.pivots]] = mine.reshape(-1, factor.d)
     return x, shared
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from scipy.linalg.blas import dsymm, dtrsm
+from scipy.linalg.blas import dgemm, dsymm, dtrsm
 from scipy.linalg.lapack import dpotri
 
 from core.geometry import Array
@@ -71,7 +71,7 @@ def _block(L: Array, W: Array, rest: Array) -> Array:
     if s:
         G = dtrsm(1.0, L, W, side=1, lower=1)
         mixed = dsymm(-1.0, rest, G, lower=1)
-        whole[:p, :p] -= G.T @ mixed
+        whole[:p, :p] -= dgemm(1.0, G, mixed, trans_a=1)
         whole[p:, :p], whole[p:, p:] = mixed, rest
     return whole
 
