@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -88,12 +89,18 @@ class Stack:
         """The tree's processes by what they are."""
         found: dict[str, list[psutil.Process]] = {}
         for child in psutil.Process(self.pid).children():
-            line = " ".join(child.cmdline())
-            words = {"valkey": "broker", "uvicorn": "api", "-Q work": "worker", "-Q sequence": "sequencer"}
-            name = next((n for word, n in words.items() if word in line), "other")
-            found[name] = [child]
-            if name in ("worker", "sequencer"):
-                found[f"{name}'s pool"] = child.children()
+            with suppress(psutil.NoSuchProcess):  # killed a moment ago, its parent has yet to notice
+                line = " ".join(child.cmdline())
+                words = {
+                    "valkey": "broker",
+                    "uvicorn": "api",
+                    "-Q work": "worker",
+                    "-Q sequence": "sequencer",
+                }
+                name = next((n for word, n in words.items() if word in line), "other")
+                found[name] = [child]
+                if name in ("worker", "sequencer"):
+                    found[f"{name}'s pool"] = child.children()
         self.ever |= {p.pid for ps in found.values() for p in ps}
         return found
 
