@@ -28,7 +28,7 @@ def create_mission(body: MissionIn, response: Response, services: Use, public_ur
     """A new, empty mission; its id is in the answer and in `Location`."""
     with services.db.write() as tx:
         scale = body.scale.known() if body.scale else UNKNOWN
-        row = missions.create(tx, body.name, body.mode, body.max_side, scale=scale)
+        row = missions.create(tx, body.name, body.mode, body.max_side, scale=scale, backfill=body.backfill)
         document = mission_document(tx, row, public_url)
     response.headers["Location"] = f"/api/v1/missions/{row.id}"
     return document

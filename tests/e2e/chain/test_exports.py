@@ -54,6 +54,12 @@ def test_exports_of_a_growing_and_of_a_final_map(
             for (z, x, y), data in held.items():
                 assert api.get(f"/revisions/{revision}/tiles/{z}/{x}/{y}").content == data
     assert revisions
+    while_it_grows = tmp_path / "growing"
+    while_it_grows.mkdir()
+    for name in NAMES:
+        assert client.download(mission_id, name, while_it_grows / name, lambda: None), name
+        assert (while_it_grows / name).stat().st_size > 0
+    assert client.progress(mission_id)["state"] == "open"
     finish(client, mission_id)
     for name in NAMES:
         assert client.download(mission_id, name, tmp_path / name, lambda: None), name
