@@ -62,7 +62,8 @@ def balance(
 ) -> Mapping[str, Gain]:
     """What each frame's channels (R, G, B) are to be multiplied with, by frame id; gains given are ignored.
 
-    `thumbs`: whole photos at about 128 px, (h, w, 3) uint8. The order of the frames does not matter.
+    `thumbs`: whole photos at about 128 px, (h, w, 3 or more) uint8, RGB first. The frames' order does
+    not matter.
     """
     return {frame.frame_id: frame.gain for frame in balanced(frames, world, thumbs, params)}
 
@@ -126,7 +127,7 @@ def _sighting(
     share = (uv + 0.5) / (camera.width, camera.height)
     scale = params.side_px / max(thumb.shape[:2])
     size = (max(2, round(thumb.shape[1] * scale)), max(2, round(thumb.shape[0] * scale)))
-    small = cv2.resize(thumb, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+    small = cv2.resize(thumb[..., :3], size, interpolation=cv2.INTER_AREA).astype(np.float64)
     inside = ((share > 0.5 / np.array(size)) & (share < 1 - 0.5 / np.array(size))).all(1)
     colour = _bilinear(small, share[inside] * size - 0.5)
     good = ((colour > params.darkest) & (colour < params.brightest)).all(1)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.sharpness import sharpness
 from core.sift import Spots, describe, find_spots, scale_space
 from core.vocabulary import appearance
 
@@ -53,7 +54,7 @@ class Features:
     `keypoints` (K, 2) float32, pixels of the ORIGINAL photo; `angle_rad` (K,) float32, clockwise as seen;
     `scale_px` (K,) float32, diameter in pixels of the original; `descriptors` (K, 128) uint8, RootSIFT × 512;
     `words` (W,) float32 of length 1 (or all zero without keypoints): compare two by their dot product;
-    `thumb` (h, w, 3) uint8 RGB, area-averaged.
+    `thumb` (h, w, 4) uint8 RGB, area-averaged, and `core.sharpness`.
     """
 
     keypoints: Floats
@@ -77,7 +78,8 @@ class Features:
             raise ValueError("not the features of a photo")
         _, k, w, th, tw = _HEAD.unpack_from(data)
         n_floats = 4 * k + w
-        if len(data) != _HEAD.size + 4 * n_floats + 128 * k + 3 * th * tw:
+        left = len(data) - _HEAD.size - 4 * n_floats - 128 * k
+        if left not in (3 * th * tw, 4 * th * tw):  # three: from before photos were asked how sharp they are
             raise ValueError("the features of this photo are cut off")
         floats = np.frombuffer(data, "<f4", n_floats, _HEAD.size).astype(np.float32)
         rest = np.frombuffer(data, np.uint8, offset=_HEAD.size + 4 * n_floats)
@@ -87,7 +89,7 @@ class Features:
             scale_px=floats[3 * k : 4 * k],
             descriptors=rest[: 128 * k].reshape(k, 128),
             words=floats[4 * k :],
-            thumb=rest[128 * k :].reshape(th, tw, 3),
+            thumb=rest[128 * k :].reshape(th, tw, -1),
         )
 
 
@@ -114,8 +116,15 @@ def extract(
         scale_px=(found.size_px * np.sqrt(to_original.prod())).astype(np.float32),
         descriptors=descriptors,
         words=appearance(descriptors),
-        thumb=_shrunk(copy, params.thumb_px),
+        thumb=thumbnail(copy, params.thumb_px),
     )
+
+
+def thumbnail(rgb: NDArray[np.uint8], side_px: int = 128) -> Bytes:
+    """A small copy (h, w, 4) uint8 of a picture (H, W, 3): RGB, and how sharp the picture is."""
+    small = _shrunk(rgb, side_px)
+    grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+    return np.dstack((small, sharpness(grey, (small.shape[1], small.shape[0]))))
 
 
 def _shrunk(rgb: NDArray[np.uint8], side_px: int) -> NDArray[np.uint8]:

@@ -30,6 +30,7 @@ from core.blend import (
 from core.geometry import Array, PosedFrame, World
 from core.grid import Grid
 from core.seams import REACH_CELLS, settle
+from core.sharpness import give_way
 from core.warp import Int32, Lattice, Rgb, Views, knots, look, warp
 
 PAD_CELLS = 2
@@ -46,7 +47,7 @@ class Photos(Protocol):
         ...
 
     def thumb(self, frame_id: str) -> Rgb:
-        """The whole photo at about 128 px, area-averaged, (h, w, 3) uint8 RGB."""
+        """The whole photo at about 128 px, (h, w, 3) uint8 RGB, or (h, w, 4) with its `core.sharpness`."""
         ...
 
 
@@ -57,7 +58,8 @@ class FusionParams:
     `bands`: Laplacian bands above the lowest; cells are 2^bands pixels. `tone_side_px`: photos are shrunk to
     this before their tones are averaged; photos whose detail differs by more than `tone_tolerance` grey
     levels are left out, lest they leave ghosts. `max_view_deg`: rays flatter than this from the vertical are
-    not drawn. `gnss_importance`: weight of frames without a visual pose. `seams`: whether they are led around
+    not drawn. `gnss_importance`: weight of frames without a visual pose; `loose_px`: sigma of a
+    position, in the photo's pixels, that halves its weight. `seams`: whether they are led around
     what photos disagree about; where not, the heaviest photo wins.
     """
 
@@ -66,6 +68,7 @@ class FusionParams:
     tone_tolerance: float = 12.0
     max_view_deg: float = 75.0
     gnss_importance: float = 0.25
+    loose_px: float = 200.0
     sampling: Literal["linear", "cubic"] = "linear"
     seams: bool = True
 
@@ -182,6 +185,7 @@ class _Scene:
         views = Views.empty(len(frames), lattice, rim)
         for k, frame in enumerate(frames):
             _look(views, k, lattice, resolution_m, frame, photos, params)
+        give_way(views.weight, views.sharp)
         inner = np.s_[:, rim : lattice.rows - rim, rim : lattice.cols - rim]
         given = np.ascontiguousarray(views.weight[inner])
         drawn = given.any(0) if kept is None else given.any(0) & kept
@@ -213,9 +217,12 @@ def _look(
     importance = min(1.0, resolution_m / gsd_m)
     if frame.pose.source == "gnss":
         importance *= params.gnss_importance
+    if frame.pose.sigma_m is not None:
+        loose_px = math.hypot(*frame.pose.sigma_m[:2]) / gsd_m
+        importance *= params.loose_px / (params.loose_px + loose_px)
     skirt_px = SKIRT_CELLS * params.cell_px * resolution_m / gsd_m
     thumb = photos.thumb(frame.frame_id)
-    tone = _shrunk(thumb, params.tone_side_px)
+    tone = _shrunk(np.ascontiguousarray(thumb[..., :3]), params.tone_side_px)
     tones = (thumb, tone, _shrunk(tone, params.tone_side_px // 4))
     min_cos_view = math.cos(math.radians(params.max_view_deg))
     look(lattice, frame, tones, importance, min_cos_view, skirt_px, views, k)

@@ -18,7 +18,7 @@ def shows_sky(thumb: Pixels) -> bool:
     All four sides are tried, for cameras are mounted any way round. Ground is seldom so: a field as even as a
     sky has no half that is so much darker.
     """
-    grey = np.asarray(thumb, np.float32).mean(2)
+    grey = np.asarray(thumb[..., :3], np.float32).mean(2)
     for turned in (grey, grey[::-1], grey.T, grey.T[::-1]):
         strip, opposite = turned[: max(1, int(STRIP * len(turned)))], turned[len(turned) // 2 :]
         if strip.std() < EVEN and strip.mean() - opposite.mean() > BRIGHTER:

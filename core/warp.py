@@ -86,10 +86,11 @@ class Views(NamedTuple):
     `weight`: int32, 0 where the frame has no say, `INSIDE` … `FULL` inside of its photo. `spot`: (…, 3) int16
     in 1/16 grey levels, gain applied: how the colours of the smallest things that a knot can tell depart from
     a much coarser mean. `own`: the photo's local mean colour. `even`: the same without the lens's falloff.
-    `detail`: how `own` departs from that much coarser mean.
+    `detail`: how `own` departs from that much coarser mean. `sharp`: uint8, `core.sharpness`, 0 = unknown.
     """
 
     weight: Int32
+    sharp: Rgb
     spot: Int16
     own: Int16
     even: Int16
@@ -104,6 +105,7 @@ class Views(NamedTuple):
         )
         return cls(
             np.zeros(wide, np.int32),
+            np.zeros(wide, np.uint8),
             np.zeros((*wide, 3), np.int16),
             *(np.zeros((*inner, 3), np.int16) for _ in range(3)),
         )
@@ -140,8 +142,9 @@ def look(
 ) -> None:
     """Weights and tones of one frame at all knots, into the k-th of `views`.
 
-    `tones`: the photo shrunk, to a few pixels, and to fewer still, (h, w, 3) uint8. `importance`: 0 … 1,
-    multiplies the weight. `skirt_px`: how far beyond the photo's edge weights fade out, in its own pixels.
+    `tones`: the photo shrunk, (h, w, 3) uint8 or with its sharpness (h, w, 4), to a few pixels, and to fewer
+    still. `importance`: 0 … 1, multiplies the weight. `skirt_px`: how far beyond the photo's edge weights
+    fade out, in its own pixels.
     """
     pose = frame.pose
     _look(
@@ -268,6 +271,22 @@ def _sample(image: Rgb, right: float, down: float, gain: NDArray[np.int64], out:
 
 
 @compiled
+def _weight(
+    u: float, v: float, cos_view: float, width: float, height: float, importance: float, skirt_px: float
+) -> int:
+    """The weight of a photo at one of its pixels, negative beyond its skirt."""
+    # The flatter a ray, the more ground a pixel covers: this way no skirt is wider on the ground.
+    beyond = max(max(-u, u - (width - 1)), max(-v, v - (height - 1))) / (cos_view * cos_view)
+    if beyond >= skirt_px:
+        return -1
+    if beyond > 0:
+        return int((INSIDE - 1) * (1 - beyond / skirt_px))
+    across, along = 2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1
+    share = (1 - across * across) * (1 - along * along) * cos_view * cos_view * cos_view * cos_view
+    return INSIDE + int((FULL - INSIDE) * importance * share)
+
+
+@compiled
 def _look(
     foot: NDArray[np.float64],
     slope: NDArray[np.float64],
@@ -275,13 +294,14 @@ def _look(
     center: NDArray[np.float64],
     h_m: float,
     lens: NDArray[np.float64],
-    sharp: Rgb,
+    thumb: Rgb,
     fine: Rgb,
     coarse: Rgb,
     gain: NDArray[np.int64],
     falloff: NDArray[np.float64],
     limits: NDArray[np.float64],
     weight: Int32,
+    sharp: Rgb,
     spot: Int16,
     own: Int16,
     light: Int16,
@@ -299,19 +319,15 @@ def _look(
         u, v, cos_view = _project(x, y, h_m, world_R_cam, center, lens)
         if cos_view < min_cos_view:
             continue
-        # The flatter a ray, the more ground a pixel covers: this way no skirt is wider on the ground.
-        beyond = max(max(-u, u - (width - 1)), max(-v, v - (height - 1))) / (cos_view * cos_view)
-        if beyond >= skirt_px:
+        w = _weight(u, v, cos_view, width, height, importance, skirt_px)
+        if w < 0:
             continue
         j, i = k // cols, k % cols
-        if beyond > 0:
-            weight[j, i] = int((INSIDE - 1) * (1 - beyond / skirt_px))
-        else:
-            across, along = 2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1
-            share = (1 - across * across) * (1 - along * along) * cos_view * cos_view * cos_view * cos_view
-            weight[j, i] = INSIDE + int((FULL - INSIDE) * importance * share)
+        weight[j, i] = w
         right, down = (u + 0.5) / width, (v + 0.5) / height
-        _sample(sharp, right, down, gain, least)
+        if thumb.shape[2] > 3 and w >= INSIDE:
+            sharp[j, i] = thumb[int(down * thumb.shape[0]), int(right * thumb.shape[1]), 3]
+        _sample(thumb, right, down, gain, least)
         _sample(coarse, right, down, gain, around)
         for c in range(3):
             spot[j, i, c] = min(max(least[c] - around[c], -16000), 16000)

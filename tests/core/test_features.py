@@ -114,14 +114,15 @@ def test_a_picture_without_anything_has_no_features_but_a_thumbnail() -> None:
     features = extract(np.full((300, 400, 3), 90, np.uint8), (4000, 3000))
     assert len(features.keypoints) == len(features.descriptors) == 0
     assert not features.words.any()
-    assert features.thumb.shape == (96, 128, 3)
-    assert (features.thumb == 90).all()
+    assert features.thumb.shape == (96, 128, 4)
+    assert (features.thumb[..., :3] == 90).all()
+    assert not features.thumb[..., 3].any()  # nor can it be said to be sharp
     assert same(Features.from_bytes(features.to_bytes()), features)
 
 
 def test_thumbnail_averages_areas() -> None:
     photo = ground(960, 1280)
-    thumb = extract(photo, (1280, 960)).thumb
+    thumb = extract(photo, (1280, 960)).thumb[..., :3]
     assert thumb.shape == (96, 128, 3)
     means = photo.reshape(96, 10, 128, 10, 3).mean((1, 3))
     assert np.abs(thumb - means).mean() < 1.5  # averaged twice, so that a few pixels differ by more

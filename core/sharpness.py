@@ -1,0 +1,67 @@
+"""How sharp a photo is, place by place, so that a blurred one gives way to its neighbours.
+
+How much the finest detail bends over that of coarser detail: the light, the ground and the haze change both
+alike, blur only the former.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.warp import INSIDE, Int32, compiled
+
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+
+_BEND = np.array([[-0.5, 1.0, -0.5]], np.float32)
+LEAST_CONTRAST = 1.5
+"""Grey levels of coarser detail below which nothing can be said: water is not blurred."""
+CLEARLY = 0.5
+"""A photo gives way where it is less than this times as sharp as another one that sees the place well."""
+WELL = 8
+"""Seeing a place well: a weight not smaller by more than this factor."""
+
+
+def sharpness(grey: Bytes, size: tuple[int, int]) -> Bytes:
+    """1 … 255, the sharper the more, or 0 where it cannot be told; (h, w) uint8.
+
+    `grey`: (H, W) uint8, all photos shrunk alike; `size`: (w, h).
+    """
+    whole = grey.astype(np.float32)
+    # A hand or a gimbal that moves blurs along one direction only: the blurrier one tells.
+    bent = [np.asarray(cv2.filter2D(whole, -1, bend), np.float32) for bend in (_BEND, _BEND.T)]
+    softer = cv2.GaussianBlur(whole, (0, 0), 2.0) - cv2.GaussianBlur(whole, (0, 0), 5.0)
+    coarse = _energy(np.asarray(softer, np.float32), size)
+    ratio = np.sqrt(np.minimum(*(_energy(band, size) for band in bent)) / np.maximum(coarse, 1e-6))
+    told = np.clip(np.rint(64 * ratio), 1, 255)
+    return np.where(coarse > LEAST_CONTRAST**2, told, 0).astype(np.uint8)
+
+
+def _energy(band: Floats, size: tuple[int, int]) -> Floats:
+    return np.asarray(
+        cv2.blur(cv2.resize(band * band, size, interpolation=cv2.INTER_AREA), (9, 9)), np.float32
+    )
+
+
+@compiled
+def give_way(weights: Int32, sharp: Bytes) -> None:
+    """Lessens, in place, the weights (photos, rows, cols) of photos that are blurred where others are sharp.
+
+    `sharp`: the `sharpness` of each photo at the same knots.
+    """
+    n, rows, cols = weights.shape
+    for y in range(rows):
+        for x in range(cols):
+            top, best = 0, 0
+            for k in range(n):
+                top = max(top, weights[k, y, x])
+            for k in range(n):
+                w = weights[k, y, x]
+                if w >= INSIDE and WELL * w >= top:
+                    best = max(best, sharp[k, y, x])
+            for k in range(n):
+                w, s = weights[k, y, x], sharp[k, y, x] / (CLEARLY * max(best, 1))
+                if w >= INSIDE and 0 < s < 1:
+                    weights[k, y, x] = INSIDE + np.int32((w - INSIDE) * s * s * s * s)
