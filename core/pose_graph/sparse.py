@@ -54,7 +54,12 @@ def laplacian_solve(pairs: IntArray, weight: Array, held: Array, pull: Array, ow
 def _solved(matrix: coo_matrix, rhs: NDArray[Any]) -> NDArray[Any] | None:
     try:
         factor = splu(
-            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            matrix.tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            relax=1,
+            panel_size=1,
+            options={"SymmetricMode": True},
         )
     except RuntimeError:
         return None
