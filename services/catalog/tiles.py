@@ -79,7 +79,11 @@ class TileBox:
 
 
 def mark_dirty(
-    tx: Session, mission_id: str, tiles: Mapping[Key, int] | Iterable[Key], generation: int, priority: int = 5
+    tx: Session,
+    mission_id: str,
+    tiles: Mapping[Key, int] | Iterable[Key],
+    generation: int,
+    priority: int = GROWN,
 ) -> None:
     """These tiles show poses older than `generation`. `tiles` may map each to its own priority, 0 first."""
     lock(tx, mission_id)
@@ -224,6 +228,7 @@ def fuse_frames(tx: Session, mission_id: str, now: float | None = None) -> Seque
         DirtyTile.x.between(FramePose.x0, FramePose.x1),
         DirtyTile.y.between(FramePose.y0, FramePose.y1),
         DirtyTile.since <= FramePose.generation,
+        DirtyTile.priority < HEAL,  # where poses moved, it is shown already
     )
     shown = (
         select(Frame.id)

@@ -32,7 +32,7 @@ def placed(frame_id: str, x: int = 0, east_m: float = 0.1, gain: float = 1.0) ->
     return Placed(frame_id, "camera", pose, TileBox(Z, x, 0, x + 1, 1), (gain, 1.0, 0.9))
 
 
-def dirty(*frames_x: int, priority: int = 5) -> dict[Key, int]:
+def dirty(*frames_x: int, priority: int = tiles.GROWN) -> dict[Key, int]:
     return {(Z, x + dx, y): priority for x in frames_x for dx in (0, 1) for y in (0, 1)}
 
 
@@ -421,6 +421,15 @@ class TestFusedFrames:
         show(db, mission_id, [render(k, 2) for k in dirty(1)])
         assert states(db, mission_id)["f1"] == "fused"
         assert dirty_keys(db, mission_id) == set()
+
+    def test_what_is_shown_already_and_only_moves_does_not_hold_it_up(
+        self, db: Database, mission_id: str, matched: list[str], owner: int
+    ) -> None:
+        moved = dict.fromkeys(list(dirty(0))[:1], tiles.HEAL)
+        save(db, mission_id, owner, PoseUpdate(placed=[placed("f0", 0)], dirty=dirty(0) | moved))
+        show(db, mission_id, [render(k, 1) for k in dirty(0).keys() - moved.keys()])
+        assert states(db, mission_id)["f0"] == "fused"
+        assert dirty_keys(db, mission_id) == set(moved)
 
     def test_a_neighbour_that_comes_later_does_not_hide_that_tiles_are_missing(
         self, db: Database, mission_id: str, matched: list[str], owner: int
