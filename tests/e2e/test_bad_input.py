@@ -248,7 +248,7 @@ Case = Callable[[list[Path], list[Path]], dict[str, bytes]]
 @pytest.mark.parametrize(
     ("photos", "sources", "said"),
     [
-        (no_gps, {"vision-only": 6}, "No photo has usable GPS"),
+        (no_gps, {"vision-only": 6}, "no photo has usable GPS"),
         (one_picture, {"visual": 4}, ""),
         (one_photo, {"gnss": 1}, ""),
         (two_strangers, {"gnss": 2}, "2 of 2 photos tie to no other"),
