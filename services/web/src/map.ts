@@ -75,6 +75,11 @@ function style(): StyleSpecification {
   };
 }
 
+/** What an error of the library says of the tile that it is about. */
+interface BrokenTile {
+  tileID: { canonical: { z: number; x: number; y: number } };
+}
+
 const key = (z: number, x: number, y: number): string => `${z}/${x}/${y}`;
 
 export class MissionMap {
@@ -90,6 +95,7 @@ export class MissionMap {
   private readonly changedAt = new Map<string, number>();
   private readonly requestedAt = new Map<string, number>();
   private readonly underWay = new Map<string, number>();
+  private readonly broken = new Set<string>();
 
   constructor(
     container: HTMLElement,
@@ -115,7 +121,11 @@ export class MissionMap {
       if ("originalEvent" in event && event.originalEvent) this.setFollowing(false);
     });
     // A tile that the server could not send is asked for again with the next change; nobody needs the console.
-    this.map.on("error", (event) => console.warn(event.error.message));
+    this.map.on("error", (event) => {
+      console.warn(event.error.message);
+      const id = (event as { tile?: BrokenTile }).tile?.tileID.canonical;
+      if (id) this.broken.add(key(id.z, id.x, id.y));
+    });
     this.map.on("sourcedata", (event) => this.recheck(event));
     this.loaded = new Promise((resolve) => void this.map.once("load", () => resolve()));
   }
@@ -201,8 +211,17 @@ export class MissionMap {
     const overdue = performance.now() - OVERDUE_MS;
     const now = [...this.changed].filter(([name]) => (this.underWay.get(name) ?? -Infinity) <= overdue);
     this.changed.clear();
+    // The library draws a tile that never had a picture when it is refreshed, and stumbles: begin afresh.
+    if (this.zoom !== null && now.some(([name]) => this.broken.has(name))) return this.begin(this.zoom);
     const tiles = now.map(([, [z, x, y]]) => ({ z, x, y }));
     if (tiles.length && this.map.getSource("tiles")) this.map.refreshTiles("tiles", tiles);
+  }
+
+  private begin(zoom: number): void {
+    this.broken.clear();
+    this.underWay.clear();
+    this.zoom = null;
+    void this.showTiles(zoom);
   }
 
   private stamp(url: string): undefined {
@@ -221,6 +240,7 @@ export class MissionMap {
     if (!id) return;
     const name = key(id.z, id.x, id.y);
     this.underWay.delete(name);
+    if (event.tile?.state === "loaded") this.broken.delete(name);
     if ((this.changedAt.get(name) ?? 0) > (this.requestedAt.get(name) ?? 0)) this.refresh([[id.z, id.x, id.y]]);
   }
 }
