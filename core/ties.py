@@ -73,13 +73,13 @@ def canonical(
     params, extra, good = params or TieParams(), list[Pair](), list(found)
     for _ in range(params.rounds):
         tries = ties_to_try(frames, (*first, *extra), good, params)
-        more = matched(tries) if tries else ()
+        if not tries:
+            break
+        more = matched(tries)
         if more is None:
             return None
         extra += tries
         good += more
-        if not more:
-            break
     ordered = sorted((m for m in good if m.accepted), key=lambda m: (m.low, m.high))
     return Canonical(tuple(first), tuple(sorted(extra)), tuple(ordered))
 

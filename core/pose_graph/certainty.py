@@ -70,10 +70,8 @@ def shared_misfit(priors: Priors, state: State, pairs: IntArray) -> Array:
         miss = np.where(known, miss - np.median(miss[known]), 0.0)
         size = 1.4826 * float(np.median(np.abs(miss[known])))
         tame = np.clip(miss, -WILD * size, WILD * size)
-        product = tame[both[:, 0]] * tame[both[:, 1]]
-        # less what independent noise is likely to show
-        doubt = 0.5 * float(np.square(tame[known]).mean()) / np.sqrt(len(both))
-        out[axis] = max(0.0, float(product.mean()) - doubt)
+        # Not less what chance may show: a sigma that is a little too wide misleads nobody.
+        out[axis] = max(0.0, float((tame[both[:, 0]] * tame[both[:, 1]]).mean()))
     return out
 
 
