@@ -64,7 +64,7 @@ def test_no_false_pair_and_no_good_one_missed(name: str, tmp_path: Path) -> None
         rgb = develop(flight, shot, expose(picture, shot))
         size = (shot.camera.width, shot.camera.height)
         by_id[hashlib.sha256(rgb.tobytes()).hexdigest()[:32]] = (shot, extract(rgb, size))
-    accepted = []
+    accepted, wrong = [], list[float]()
     for low, high in combinations(sorted(by_id), 2):
         (a, fa), (b, fb) = by_id[low], by_id[high]
         match = match_pair(low, fa, high, fb, a.camera, b.camera)
@@ -72,9 +72,11 @@ def test_no_false_pair_and_no_good_one_missed(name: str, tmp_path: Path) -> None
             accepted.append((low, high))
             errors = errors_px(flight, a, b, match)
             assert np.median(errors) < 1
-            assert (errors > 4).mean() < 0.05
+            assert (errors > 4).mean() < 0.1
+            wrong += (errors > 4).tolist()
         else:
             assert shared(flight, a, b) < 0.35
+    assert np.mean(wrong) < 0.005
     assert components(sorted(by_id), accepted) == [len(by_id)]
 
 
