@@ -47,9 +47,9 @@ FEATURE_SIDE_PX = FeatureParams().side_px
 """Keypoints are found on a copy of this size, so nothing larger is decoded for them."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """The features of one photo.
+    """The features of one photo; equal only to themselves.
 
     `keypoints` (K, 2) float32, pixels of the ORIGINAL photo; `angle_rad` (K,) float32, clockwise as seen;
     `scale_px` (K,) float32, diameter in pixels of the original; `descriptors` (K, 128) uint8, RootSIFT × 512;

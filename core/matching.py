@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import astuple, dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -169,6 +170,8 @@ def match_pair(
     return verdict("ok", final, *counts, len(guided), len(final))
 
 
+# A photo is matched with its neighbours one after the other; a view is half a megabyte.
+@lru_cache(maxsize=24)
 def _view(features: Features, camera: Camera, params: MatchParams) -> _View:
     scale = params.side_px / max(camera.width, camera.height)
     xy = camera.rays(features.keypoints.astype(np.float64))[:, :2] * (camera.f_px * scale)
