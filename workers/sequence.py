@@ -210,6 +210,7 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
         update = update_of(after, known.camera_keys, new_ids)
     with db.write() as tx:
         generation = poses.save(tx, mission.id, epoch, replace(update, dirty=dirty))
+        tiles.fuse_frames(tx, mission.id)  # whose ground is all shown already waits for nobody's tiles
         clock.spend(tx, mission.id, "pose")
     known.untried |= new_ids
     known.layout, known.generation = after, generation

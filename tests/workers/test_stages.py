@@ -67,6 +67,18 @@ def test_the_live_map_comes_to_rest_after_every_photo(
     assert bench.tiles() == expected
 
 
+def test_a_photo_whose_ground_is_shown_is_on_the_map_as_soon_as_it_is_posed(
+    bench: Any, photos: list[tuple[str, bytes]]
+) -> None:
+    bench.upload(photos[:6])
+    bench.drain()
+    bench.upload([("again.jpg", photos[2][1] + b"\0")])  # the same picture, another photo
+    while bench.frame_states()["again.jpg"] not in ("posed", "fused"):
+        name, args = bench.queue.pop(0)
+        bench.handle(name, *args)
+    assert bench.frame_states()["again.jpg"] == "fused"
+
+
 def test_everything_once_more_changes_no_row(bench: Any, photos: list[tuple[str, bytes]]) -> None:
     bench.upload(photos[:4])
     log: list[tuple[str, tuple[Any, ...]]] = []
