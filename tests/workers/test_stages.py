@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import sys
 from io import BytesIO
 from typing import Any
 
@@ -68,11 +69,15 @@ def test_the_live_map_comes_to_rest_after_every_photo(
 
 
 def test_a_photo_whose_ground_is_shown_is_on_the_map_as_soon_as_it_is_posed(
-    bench: Any, photos: list[tuple[str, bytes]]
+    bench: Any, photos: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench.upload(photos[:6])
+    bench.upload(photos[:8])
     bench.drain()
-    bench.upload([("again.jpg", photos[2][1] + b"\0")])  # the same picture, another photo
+    sequence = bench.modules["sequence"]
+    monkeypatch.setattr(sequence, "FEW", 2)  # few photos are solved all together otherwise
+    # As in the middle of a large map, all of whose tiles there are full.
+    monkeypatch.setattr(sequence, "changed", lambda *_: sys.modules["workers.posing"].Changes({}, {}))
+    bench.upload([("again.jpg", photos[4][1] + b"\0")])
     while bench.frame_states()["again.jpg"] not in ("posed", "fused"):
         name, args = bench.queue.pop(0)
         bench.handle(name, *args)
