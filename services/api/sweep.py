@@ -11,7 +11,7 @@ from typing import Any
 
 import structlog
 
-from services.catalog import missions, wakes
+from services.catalog import missions, standstill
 from services.database import Database
 from services.settings import Settings
 from services.storage import ObjectStore
@@ -44,7 +44,7 @@ class Sweep:
     def once(self) -> None:
         """One sweep."""
         with self._db.write() as tx:
-            stalled = wakes.stalled(tx, self._settings.stalled_after_s)
+            stalled = standstill.stalled(tx, self._settings.stalled_after_s)
         for wake in stalled:
             self._send(wake.task, *wake.args)
         with self._db.read() as tx:

@@ -1,12 +1,9 @@
-"""What stands still and whom to wake: the sweep's one question to the catalog."""
+"""A task that is worth sending because something in the catalog is ready for it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
-
-from sqlalchemy.orm import Session
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,14 +12,3 @@ class Wake:
 
     task: str
     args: tuple[Any, ...]
-
-
-def stalled(tx: Session, older_than_s: float, now: float | None = None) -> Sequence[Wake]:
-    """Everything that stood still for `older_than_s`, stamped so that the next sweep waits as long again."""
-    from services.catalog import exports, frames, missions  # they make Wakes
-
-    return [
-        *frames.stalled(tx, older_than_s, now),
-        *missions.stalled(tx, older_than_s, now),
-        *exports.stalled(tx, older_than_s, now),
-    ]

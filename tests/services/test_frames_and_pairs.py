@@ -12,7 +12,8 @@ from core.errors import EmptyFile
 from core.frame import FrameMeta, GpsFix
 from services.catalog import events, frames, missions, pairs
 from services.catalog.pairs import PairResult
-from services.catalog.wakes import Wake, stalled
+from services.catalog.standstill import stalled
+from services.catalog.wakes import Wake
 from services.database import Database
 from services.errors import FrameNotFound, MissionNotFound
 from services.tables import Frame

@@ -10,8 +10,9 @@ from sqlalchemy import func, select
 from core.frame import FrameMeta
 from services.catalog import events, exports, frames, leases, missions, poses, tiles
 from services.catalog.poses import PoseUpdate
+from services.catalog.standstill import stalled
 from services.catalog.tiles import Render
-from services.catalog.wakes import Wake, stalled
+from services.catalog.wakes import Wake
 from services.database import Database
 from services.errors import MissionNotFound
 from services.tables import Base, Mission

@@ -14,8 +14,9 @@ from core.frame import FrameMeta
 from core.geometry import Camera, Pose, PosedFrame, World
 from services.catalog import events, frames, leases, missions, poses, tiles
 from services.catalog.poses import Placed, PoseUpdate
+from services.catalog.standstill import stalled
 from services.catalog.tiles import Key, Render, TileBox
-from services.catalog.wakes import Wake, stalled
+from services.catalog.wakes import Wake
 from services.database import Database
 from services.errors import LeaseLost, MissionNotFound, RevisionConflict
 from services.tables import DirtyTile
