@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 from core.coverage import overview, quarter, top_zoom
 from core.grid import TileKey, ancestors, children, parent
-from services.catalog import backlog, missions, sharpening, tiles
+from services.catalog import backlog, missions, publishing, sharpening, tiles
 from services.catalog.tiles import Key, Render, TileBox
 from services.errors import RevisionConflict
 from services.queue import send
@@ -23,7 +24,9 @@ the overviews up to the top.
 
 @stage("publish")
 def publish(mission_id: str) -> None:
-    """Flip what was rendered, and its overviews, in one transaction; whoever loses the race tries again."""
+    """Flip what was rendered, and its overviews, in one transaction; whoever comes meanwhile leaves it all
+    to the one who is at it.
+    """
     while True:
         clock = Stopwatch()
         with db.read() as tx:
@@ -40,15 +43,31 @@ def publish(mission_id: str) -> None:
         if more and len(pending) < (ENOUGH if final else ENOUGH_LIVE):
             break  # whoever draws the last of them wakes us
         left = awaited - {render.key for render in pending}
-        changes = _with_overviews(mission, pending, bounds, left)
         try:
-            with db.write() as tx:
-                revision = tiles.publish(tx, mission_id, mission.revision, changes, pending)
-                clock.spend(tx, mission_id, "publish")
+            with _at_it(mission) as mine:
+                if not mine:
+                    break  # who is at it looks again when that is done
+                changes = _with_overviews(mission, pending, bounds, left)
+                with db.write() as tx:
+                    revision = tiles.publish(tx, mission_id, mission.revision, changes, pending)
+                    clock.spend(tx, mission_id, "publish")
         except RevisionConflict:
             continue
         log.info("published", mission=mission_id, revision=revision, tiles=len(changes))
     send("sequence", mission_id)
+
+
+@contextmanager
+def _at_it(mission: Mission) -> Iterator[bool]:
+    """Whether this worker is the one to publish; nobody else does until the end of the block."""
+    with db.write() as tx:
+        claim = publishing.claim(tx, mission.id, mission.revision, CLAIM_TTL_S)
+    try:
+        yield claim is not None
+    finally:
+        if claim is not None:
+            with db.write() as tx:
+                publishing.release(tx, mission.id, claim)
 
 
 def _with_overviews(
