@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.warp import INSIDE, Int16, Int32, Rgb, compiled
+from core.compiled import compiled
+from core.warp import INSIDE, Int16, Int32, Rgb
 
 Labels = NDArray[np.int16]
 Fine = NDArray[np.float32]

@@ -15,8 +15,8 @@ import simplejpeg
 from numpy.typing import NDArray
 from PIL import Image
 
+from core.compiled import compiled
 from core.grid import TILE_PX
-from core.warp import compiled
 
 Rgba = NDArray[np.uint8]
 

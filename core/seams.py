@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.warp import FULL, INSIDE, Int16, Int32, compiled
+from core.compiled import compiled
+from core.warp import FULL, INSIDE, Int16, Int32
 
 Costs = NDArray[np.float32]
 

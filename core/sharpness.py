@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.warp import INSIDE, Int32, compiled
+from core.compiled import compiled
+from core.warp import INSIDE, Int32
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]

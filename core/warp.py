@@ -8,21 +8,18 @@ is bilinear and exact, so that a pixel's value does not depend on the window tha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, ParamSpec, TypeVar, cast
+from typing import NamedTuple
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from core.compiled import compiled
 from core.geometry import Camera, PosedFrame, World
 from core.grid import Columns, Grid
 
-P = ParamSpec("P")
-T = TypeVar("T")
 Int16 = NDArray[np.int16]
 Int32 = NDArray[np.int32]
 Rgb = NDArray[np.uint8]
@@ -33,11 +30,6 @@ INSIDE = 256
 """A knot's weight from here on means that it lies inside of the photo; below, that it is near it."""
 FULL = 65535
 """The weight of a photo's centre seen straight down."""
-
-
-def compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """`numba.njit` without the GIL, kept on disk, and known to the type checker."""
-    return cast(Callable[P, T], numba.njit(cache=True, nogil=True)(function))
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,16 +7,14 @@ The border and the right-hand side ride along as the last rows of every front, s
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-import numba
 import numpy as np
 from scipy.linalg import cython_blas
 from scipy.linalg.blas import dgemv, dsyrk, dtrsm, dtrsv
 from scipy.linalg.lapack import dpotrf
 
+from core.compiled import compiled
 from core.geometry import Array
 from core.pose_graph.elimination import Front
 from core.pose_graph.residuals import IntArray
@@ -46,6 +44,7 @@ class Factor:
     d: int
 
 
+@compiled
 def _enter(
     panel: Array, nodes: IntArray, pivots: int, pairs: IntArray, frame: Array, pair: Array, tail: Array
 ) -> None:
@@ -64,6 +63,7 @@ def _enter(
                 panel[row * d + a, col * d + b] += pair[e, b, a] if flipped else pair[e, a, b]
 
 
+@compiled
 def _hand_on(panel: Array, rest: Array, child: Array, at: IntArray, d: int) -> None:
     """Add what a `child` leaves (lower triangle) to its parent's first columns and to the `rest`, in place.
 
@@ -92,9 +92,6 @@ def _on_one_thread() -> None:
 
 
 _on_one_thread()
-_compile: Callable[[Any], Any] = numba.njit(cache=True, nogil=True)
-_enter = _compile(_enter)
-_hand_on = _compile(_hand_on)
 
 
 def factorise(

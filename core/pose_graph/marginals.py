@@ -6,20 +6,20 @@ The inverse's diagonal follows from the factor without the rest of the inverse (
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-import numba
 import numpy as np
 from scipy.linalg.blas import dgemm, dsymm, dtrsm
 from scipy.linalg.lapack import dpotri
 
+from core.compiled import compiled
 from core.geometry import Array
 from core.pose_graph.elimination import Front
 from core.pose_graph.factor import Factor
 from core.pose_graph.residuals import IntArray
 
 
+@compiled
 def _pick(out: Array, above: Array, at: IntArray, d: int) -> None:
     """Fill `out` (lower triangle) with what `above` has of the nodes `at` and of the border."""
     size = len(out)
@@ -29,10 +29,6 @@ def _pick(out: Array, above: Array, at: IntArray, d: int) -> None:
     for q in range(size):
         for p in range(q, size):
             out[p, q] = above[where[p], where[q]]
-
-
-_compile: Callable[[Any], Any] = numba.njit(cache=True, nogil=True)
-_pick = _compile(_pick)
 
 
 def covariances(factor: Factor, n: int) -> Array:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from core.compiled import compiled
 from core.geometry import Array, Camera
 from core.matching import PairMatch
 from core.pose_graph.model import PoseParams
@@ -18,7 +17,6 @@ from core.pose_graph.residuals import Edges, IntArray
 from core.pose_graph.sparse import ComplexArray
 
 GRID = 8
-_compile: Callable[[Any], Any] = numba.njit(cache=True, nogil=True)
 
 
 def edges_of(
@@ -62,7 +60,7 @@ def spread(where: Array, group: IntArray, limit: int) -> NDArray[np.int64]:
     return np.flatnonzero(keep)
 
 
-@_compile
+@compiled
 def _take_turns(cell: IntArray, starts: IntArray, limit: int, keep: NDArray[np.bool_]) -> None:
     """Flag in `keep` the first points of all cells, then the second ones …, `limit` in each group."""
     for k in range(len(starts) - 1):

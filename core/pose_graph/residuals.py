@@ -8,14 +8,12 @@ three: log f, k1, k2. Compiled, because a mission has a million correspondences 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from core.compiled import compiled_loosely
 from core.geometry import Array
 
 IntArray = NDArray[np.int64]
@@ -107,6 +105,7 @@ def rotations(omega: Array) -> Array:
     return np.asarray(np.eye(3) + s * K + (1 - c) * (K @ K))
 
 
+@compiled_loosely
 def _undistorted(d0: float, d1: float, lens: Array) -> tuple[float, float, float, float]:
     """The ray's x, y, its distortion factor and r² of a pixel from the principal point: Newton on
     r_d = r (1 + k1 r² + k2 r⁴).
@@ -123,12 +122,13 @@ def _undistorted(d0: float, d1: float, lens: Array) -> tuple[float, float, float
     return xd / s, yd / s, s, r2
 
 
+@compiled_loosely
 def _derive(
     Ri: Array, li: Array, Rj: Array, x: float, y: float, s: float, r2: float, lam: float,
     bx: float, by: float, q0: float, q1: float, q2: float,
     u: float, v: float, w2: float, sj: float, mj: float, g: float, J: Array,
 ) -> None:  # fmt: skip
-    """The Jacobian J (2, 16) of `_observe`, from its intermediate values."""
+    """The Jacobian J (2, 16) of `observe`, from its intermediate values."""
     # d(pixel)/d(q) = g (sj I + mj y yᵀ) [I | −y] / q2
     a00, a01, a11 = g * (sj + mj * u * u) / q2, g * mj * u * v / q2, g * (sj + mj * v * v) / q2
     for k in range(2):
@@ -154,7 +154,8 @@ def _derive(
         J[k, 13], J[k, 14], J[k, 15] = y_k * sj, y_k * w2, y_k * w2 * w2
 
 
-def _observe(
+@compiled_loosely
+def observe(
     d0: float, d1: float, e0: float, e1: float,
     Ri: Array, ti: Array, hi: float, li: Array, Rj: Array, tj: Array, lj: Array, J: Array, out: Array,
 ) -> bool:  # fmt: skip
@@ -189,7 +190,7 @@ def _observe(
 
 
 def _spread_columns(first: int, second: int, lens_first: int, lens_second: int) -> Array:
-    """(16, 20): columns of `_observe` → unknowns of a pair (frame, frame, lens, lens), each block's offset
+    """(16, 20): columns of `observe` → unknowns of a pair (frame, frame, lens, lens), each block's offset
     given.
     """
     T = np.zeros((16, 20))
@@ -212,14 +213,15 @@ def _spread_columns(first: int, second: int, lens_first: int, lens_second: int) 
 SPREAD = tuple(
     _spread_columns(*offsets) for offsets in ((0, 7, 14, 14), (7, 0, 14, 14), (0, 7, 14, 17), (7, 0, 17, 14))
 )
-# The few numbers in those matrices: (way + 2·(two lenses), entry) → column of `_observe`, unknown, factor.
+# The few numbers in those matrices: (way + 2·(two lenses), entry) → column of `observe`, unknown, factor.
 SOURCE = np.stack([np.nonzero(T)[0] for T in SPREAD])
 TARGET = np.stack([np.nonzero(T)[1] for T in SPREAD])
 FACTOR = np.stack([T[np.nonzero(T)] for T in SPREAD])
 
 
+@compiled_loosely
 def _gather(K: Array, source: IntArray, target: IntArray, factor: Array, H: Array, g: Array) -> None:
-    """Turn the products K (17, 17) of `_observe`'s columns into the pair's H (20, 20) and g (20)."""
+    """Turn the products K (17, 17) of `observe`'s columns into the pair's H (20, 20) and g (20)."""
     for p in range(len(source)):
         row, a, fp = source[p], target[p], factor[p]
         g[a] -= fp * K[row, 16]
@@ -227,6 +229,7 @@ def _gather(K: Array, source: IntArray, target: IntArray, factor: Array, H: Arra
             H[a, target[q]] += fp * factor[q] * K[row, source[q]]
 
 
+@compiled_loosely
 def _scatter(
     H: Array, g: Array, i: int, j: int, lens_i: int, lens_j: int, frame: Array, pair: Array, cross: Array,
     border: Array, frame_rhs: Array, border_rhs: Array, at: IntArray,
@@ -254,6 +257,7 @@ def _scatter(
             pair[a, b] = H[a, 7 + b]
 
 
+@compiled_loosely
 def _accumulate(
     pairs: IntArray, starts: IntArray, uv: Array, weight: Array, camera: IntArray,
     R: Array, t: Array, h: Array, lens: Array, sigma: Array, scale: float,
@@ -279,9 +283,7 @@ def _accumulate(
             Ri, ti, hi, Li, Rj, tj, Lj = R[i], t[i], h[i], lens[camera[i]], R[j], t[j], lens[lj]
             a, b, used, far = 2 * way, 2 - 2 * way, 0, 1.0
             for m in range(starts[e], starts[e + 1]):
-                ok = _observe(
-                    uv[m, a], uv[m, a + 1], uv[m, b], uv[m, b + 1], Ri, ti, hi, Li, Rj, tj, Lj, J, r
-                )
+                ok = observe(uv[m, a], uv[m, a + 1], uv[m, b], uv[m, b + 1], Ri, ti, hi, Li, Rj, tj, Lj, J, r)
                 s2 = (r[0] * r[0] + r[1] * r[1]) / (sigma[lj] * sigma[lj]) if ok else 1e6
                 squared[m, way] = s2
                 # the logarithm of a product: one call for many points, before it overflows
@@ -307,18 +309,6 @@ def _accumulate(
             H, g, pairs[e, 0], pairs[e, 1], li, lj, frame, pair[e], cross, border, frame_rhs, border_rhs, at
         )
     return cost
-
-
-_compile: Callable[[Any], Any] = numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"contract"}
-)
-observe = _observe  # the plain Python function, for tests
-_undistorted = _compile(_undistorted)
-_derive = _compile(_derive)
-_observe = _compile(_observe)
-_gather = _compile(_gather)
-_scatter = _compile(_scatter)
-_accumulate = _compile(_accumulate)
 
 
 def linearise(edges: Edges, state: State, sigma_px: Array, robust_scale: float) -> Normal:

@@ -8,13 +8,11 @@ still has an answer, and only one (where decomposing a homography gives two, or 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-import numba
 import numpy as np
 
+from core.compiled import compiled
 from core.geometry import Array
 from core.pose_graph.attitude import level_to_world
 from core.pose_graph.averaging import Moments, ratios
@@ -84,7 +82,8 @@ def _planar(
     return x, np.sqrt(left * spread / INDEPENDENT)
 
 
-def _products(
+@compiled
+def _sum_products(
     first: ComplexArray, second: ComplexArray, starts: IntArray, z: ComplexArray, normal: Array
 ) -> None:
     """Means over each pair's points of AᵀA, in `normal` (E, 9, 9): A's last column is what is left over."""
@@ -104,7 +103,3 @@ def _products(
             for b in range(a, 9):
                 total[a, b] /= starts[e + 1] - starts[e]
                 total[b, a] = total[a, b]
-
-
-_compile: Callable[[Any], Any] = numba.njit(cache=True, nogil=True)
-_sum_products = _compile(_products)
