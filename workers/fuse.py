@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from core.coverage import FUSION, Encoded, block_grid, blocks, draw_block, tiles_under
+from core.coverage import FUSION, Encoded, block_grid, blocks, draw_block, overview, quarter, tiles_under
 from core.fusion import FrameIndex
-from core.grid import TileKey
+from core.grid import TileKey, children, parent
 from core.inputs import frame_digest, tile_inputs
 from core.patching import fill_block
 from services.catalog import backlog, missions, poses, tiles
 from services.catalog.backlog import ToDraw
 from services.catalog.poses import Placed, Poses
-from services.catalog.tiles import Key, Render, TileBox
+from services.catalog.tiles import Above, Key, Render, TileBox
 from services.queue import send
 from services.tables import Mission
 from workers import warmup
@@ -114,8 +114,28 @@ def _redrawn(
     photos = MissionPhotos(shelf, mission.id, mission.tile_side)
     found = draw_block(left, known.world, index, photos)
     made = [put_tile(store, mission.id, wanted[t].generation, t, p, inputs[t]) for t, p in found.items()]
+    if len(left) == len(wanted) and mission.final_generation is not None:
+        made = _with_above(mission.id, made, found)
     grid = block_grid(left)
     return [*done, *made], grid.width * grid.height
+
+
+def _with_above(
+    mission_id: str, made: Sequence[Render], found: Mapping[TileKey, Encoded | None]
+) -> list[Render]:
+    """Siblings, all of which were drawn now, with their overview on one of them: publish finds it ready."""
+    pictures_of = {TileKey(*r.key): r.object_key for r in made if r.object_key is not None}
+    if not pictures_of:
+        return list(made)
+    first = min(pictures_of)
+    above = parent(first)
+    encoded = [found.get(child) for child in children(above)]
+    put = put_tile(
+        store, mission_id, 0, above, overview([None if e is None else quarter(e[0]) for e in encoded])
+    )
+    of = tuple(pictures_of.get(child) for child in children(above))
+    ready = Above(of, put.object_key, put.etag, put.media_type, put.size_bytes)
+    return [replace(r, above=ready) if r.key == first else r for r in made]
 
 
 def _filled(

@@ -114,16 +114,16 @@ def _overviews(
             return below[tile].object_key
         return shown[tile].object_key if tile in shown else None
 
-    return {
-        tile: put_tile(
-            store,
-            mission_id,
-            generation,
-            tile,
-            overview([quarters.get(picture_key(c)) for c in children(tile)]),
-        )
-        for tile in stale
-    }
+    ready = {parent(tile): render.above for tile, render in below.items() if render.above is not None}
+
+    def made(tile: TileKey) -> Render:
+        of = tuple(picture_key(c) for c in children(tile))
+        above = ready.get(tile)
+        if above is not None and above.of == of:
+            return Render(tile, generation, above.object_key, above.etag, above.media_type, above.size_bytes)
+        return put_tile(store, mission_id, generation, tile, overview([quarters.get(key) for key in of]))
+
+    return {tile: made(tile) for tile in stale}
 
 
 def _top(mission: Mission, renders: Mapping[TileKey, Render], bounds: TileBox | None, partly: bool) -> int:

@@ -7,7 +7,7 @@ published, and the tile stays dirty.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from sqlalchemy import (
@@ -39,11 +39,22 @@ the mission is solved finally, those before HEAL are only drawn where they show 
 
 
 @dataclass(frozen=True, slots=True)
+class Above:
+    """The overview of four tiles. `of`: their objects (NW, NE, SW, SE), None for one that is empty."""
+
+    of: tuple[str | None, ...]
+    object_key: str | None
+    etag: str | None
+    media_type: str | None
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
 class Render:
     """One tile's new picture, drawn from the poses of `generation`. Without an object it is empty.
 
     `etag`: a digest of the encoded picture, equal for equal bytes. `inputs`: of all that it was drawn from,
-    when it was drawn as a whole.
+    when it was drawn as a whole. `above`: the overview of it and its siblings, where that was made with them.
     """
 
     key: Key
@@ -53,6 +64,7 @@ class Render:
     media_type: str | None = None
     size_bytes: int = 0
     inputs: str | None = None
+    above: Above | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -435,12 +447,15 @@ def _rendered_json(render: Render) -> dict[str, Any]:
         "media_type": render.media_type,
         "size_bytes": render.size_bytes,
         "inputs": render.inputs,
+        "above": None if render.above is None else asdict(render.above),
     }
 
 
 def waiting(row: DirtyTile) -> Render:
     """What was rendered for this tile last and is not published yet."""
     fields = {k: v for k, v in (row.rendered or {}).items() if k != "empty"}
+    if above := fields.get("above"):
+        fields["above"] = Above(**above | {"of": tuple(above["of"])})
     return Render((row.z, row.x, row.y), row.rendered_generation or 0, **fields)
 
 

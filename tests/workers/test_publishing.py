@@ -1,0 +1,55 @@
+"""What publishing leaves to do: the overviews next to the tiles are made where those are drawn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from services.catalog import missions
+
+
+def test_the_final_pass_leaves_no_overview_of_native_tiles_to_publish(
+    bench: Any,
+    photos: list[tuple[str, bytes]],
+    expected: dict[tuple[int, int, int], bytes],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    publish = bench.modules["publish"]
+    made: list[int] = []
+    really = publish.put_tile
+
+    def remember(store: Any, mission_id: str, generation: int, tile: Any, encoded: Any) -> Any:
+        if encoded is not None:
+            made.append(tile.z)
+        return really(store, mission_id, generation, tile, encoded)
+
+    bench.upload(photos)
+    bench.drain()
+    monkeypatch.setattr(publish, "put_tile", remember)
+    bench.finalise()
+    bench.drain()
+    with bench.db.read() as tx:
+        zoom = missions.get(tx, bench.mission_id).zoom
+    assert made
+    assert max(made) < zoom - 1
+    assert bench.tiles() == expected
+
+
+def test_an_overview_made_with_other_siblings_than_are_shown_is_made_again(
+    bench: Any, photos: list[tuple[str, bytes]], expected: dict[tuple[int, int, int], bytes]
+) -> None:
+    """As when a run of tiles was cut off between two siblings, and done again."""
+    bench.upload(photos)
+    bench.drain()
+    bench.finalise()
+    chance = True
+    while bench.queue:
+        name, args = bench.queue.pop(0)
+        if name == "fuse" and chance:
+            chance, (mission_id, keys) = False, args
+            for key in keys:  # one by one: each makes an overview of itself alone
+                bench.handle("fuse", mission_id, [key])
+        bench.handle(name, *args)
+    assert bench.state == "final"
+    assert bench.tiles() == expected
