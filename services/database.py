@@ -22,6 +22,13 @@ from sqlalchemy.orm import Session
 _BUSY_TIMEOUT_MS = 30_000
 _MIGRATION_LOCK = 7_041_776  # any number, the same for everybody who migrates this schema
 
+_READ, _DURABLE, _HASTY = "read", "durable", "hasty"
+_PRAGMAS = {
+    _READ: ("PRAGMA query_only = 1",),
+    _DURABLE: ("PRAGMA query_only = 0", "PRAGMA synchronous = FULL"),
+    _HASTY: ("PRAGMA query_only = 0", "PRAGMA synchronous = NORMAL"),
+}
+
 # NaN is no JSON: SQLite would store it and Postgres refuse it, so both refuse.
 _to_json = partial(json.dumps, allow_nan=False, separators=(",", ":"))
 
@@ -33,7 +40,8 @@ class Database:
         """`url`: SQLAlchemy's form; postgresql:// means psycopg 3."""
         self.url = _normalised(url)
         self.engine = _sqlite_engine(self.url) if self.is_sqlite else _postgres_engine(self.url)
-        self._writer = self.engine.execution_options(orthostream_write=True)
+        self._writer = self.engine.execution_options(orthostream_write=_DURABLE)
+        self._hasty_writer = self.engine.execution_options(orthostream_write=_HASTY)
         self._reader = (
             self.engine
             if self.is_sqlite
@@ -54,9 +62,16 @@ class Database:
         return self.url.get_backend_name() == "sqlite"
 
     @contextmanager
-    def write(self) -> Iterator[Session]:
-        """A transaction that may write: commits at the end of the block, rolls back on any exception."""
-        with self._turn, Session(self._writer, expire_on_commit=False) as tx, tx.begin():
+    def write(self, durable: bool = True) -> Iterator[Session]:
+        """A transaction that may write: commits at the end of the block, rolls back on any exception.
+
+        Not `durable`: a power cut may take it back, as long as no durable one has followed it; nothing else
+        can. For what is done again when it is not there.
+        """
+        writer = self._writer if durable else self._hasty_writer
+        with self._turn, Session(writer, expire_on_commit=False) as tx, tx.begin():
+            if not durable and not self.is_sqlite:
+                tx.execute(text("SET LOCAL synchronous_commit TO off"))
             yield tx
 
     @contextmanager
@@ -151,7 +166,6 @@ def _prepare_sqlite(connection: Any, _record: object) -> None:
     cursor = connection.cursor()
     cursor.execute(f"PRAGMA busy_timeout = {_BUSY_TIMEOUT_MS}")
     _enter_wal(cursor)
-    cursor.execute("PRAGMA synchronous = FULL")
     cursor.execute("PRAGMA foreign_keys = ON")
     cursor.close()
 
@@ -172,9 +186,12 @@ def _enter_wal(cursor: Any) -> None:
 def _begin_sqlite(connection: Connection) -> None:
     # A deferred transaction that reads, then writes, loses updates of others without an error: writers
     # take the lock first.
-    write = connection.get_execution_options().get("orthostream_write", False)
-    connection.exec_driver_sql(f"PRAGMA query_only = {0 if write else 1}")
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
+    kind = connection.get_execution_options().get("orthostream_write", _READ)
+    if connection.info.get("orthostream_write") != kind:
+        for pragma in _PRAGMAS[kind]:
+            connection.exec_driver_sql(pragma)
+        connection.info["orthostream_write"] = kind
+    connection.exec_driver_sql("BEGIN" if kind == _READ else "BEGIN IMMEDIATE")
 
 
 def _forget_connections_in_children(engine: Engine) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 from core.decode import decode_rgb
 from core.errors import PhotoLost, RejectedFrame
@@ -12,9 +13,9 @@ from core.frame import FrameMeta
 from core.metadata import read_metadata
 from core.photo import probe
 from services.catalog import frames
+from services.catalog.frames import Attempt
 from services.errors import ObjectNotFound, OutOfDisk
 from services.queue import send
-from services.tables import Frame
 from workers.app import MAX_ATTEMPTS, Stopwatch, db, go_on, log, settings, stage, store
 from workers.photos import features_key, photo_key
 
@@ -29,33 +30,39 @@ class Unreadable(RejectedFrame):
 def ingest(mission_id: str, frame_id: str) -> None:
     """From received to ready or rejected."""
     clock = Stopwatch()
-    with db.read() as tx:
-        frame = frames.get(tx, mission_id, frame_id)
-    if frame.state == "received":
-        with db.write() as tx:
-            attempts = frames.begin(tx, mission_id, frame_id)  # counts also those that end in a crash
-        if attempts > MAX_ATTEMPTS:
-            _put_off(mission_id, frame_id, attempts, Unreadable())
-            return
-        try:
-            with _uncounted(mission_id, frame_id):
-                data = store.get(photo_key(mission_id, frame_id))
-        except ObjectNotFound:
-            _put_off(mission_id, frame_id, attempts, PhotoLost())
-            return
-        try:
-            meta, features = read(data, frame)
-        except Exception as error:
-            _put_off(mission_id, frame_id, attempts, error)
-            return
+    with db.write(durable=False) as tx:
+        attempt = frames.begin(tx, mission_id, frame_id)  # counts also those that end in a crash
+    if attempt is None:
+        with db.read() as tx:
+            ready = frames.get(tx, mission_id, frame_id).state == "ready"
+    else:
+        ready = _read_in(mission_id, frame_id, attempt, clock)
+    if ready:
+        go_on("match", mission_id, frame_id)
+
+
+def _read_in(mission_id: str, frame_id: str, attempt: Attempt, clock: Stopwatch) -> bool:
+    """One attempt; whether the frame is ready now."""
+    if attempt.number > MAX_ATTEMPTS:
+        _put_off(mission_id, frame_id, attempt.number, Unreadable())
+        return False
+    try:
         with _uncounted(mission_id, frame_id):
-            store.put(features_key(mission_id, frame_id), features.to_bytes())
-        with db.write() as tx:
-            if frames.mark_ready(tx, mission_id, frame_id, meta):
-                clock.spend(tx, mission_id, "ingest")
-    elif frame.state != "ready":
-        return
-    go_on("match", mission_id, frame_id)
+            data = store.get(photo_key(mission_id, frame_id))
+    except ObjectNotFound:
+        _put_off(mission_id, frame_id, attempt.number, PhotoLost())
+        return False
+    try:
+        meta, features = read(data, attempt.telemetry)
+    except Exception as error:
+        _put_off(mission_id, frame_id, attempt.number, error)
+        return False
+    with _uncounted(mission_id, frame_id):
+        store.put(features_key(mission_id, frame_id), features.to_bytes())
+    with db.write(durable=False) as tx:
+        if frames.mark_ready(tx, mission_id, frame_id, meta):
+            clock.spend(tx, mission_id, "ingest")
+    return True
 
 
 @contextmanager
@@ -69,9 +76,9 @@ def _uncounted(mission_id: str, frame_id: str) -> Iterator[None]:
         raise
 
 
-def read(data: bytes, frame: Frame) -> tuple[FrameMeta, Features]:
+def read(data: bytes, telemetry: Mapping[str, Any] | None) -> tuple[FrameMeta, Features]:
     """All that is kept of a photo. Raises RejectedFrame."""
-    meta = read_metadata(data, probe(data, settings.photo_limits), frame.telemetry)
+    meta = read_metadata(data, probe(data, settings.photo_limits), telemetry)
     rgb = decode_rgb(data, FEATURE_SIDE_PX)
     return meta, extract(rgb, (meta.width, meta.height))
 

@@ -20,9 +20,8 @@ from services.api.documents import FrameState, UploadedFrame, UploadOut
 from services.api.multipart import FormReader, ReceivedFile, clean_name
 from services.api.problems import AllRefused, BadUpload, NoPhotos, as_ours
 from services.catalog import frames, missions
-from services.catalog.frames import NOT_ITS_FAULT
-from services.errors import FrameNotFound, OutOfDisk
-from services.tables import Frame
+from services.catalog.frames import NOT_ITS_FAULT, Upload
+from services.errors import OutOfDisk
 
 router = APIRouter(tags=["frames"])
 
@@ -191,32 +190,33 @@ def _accept(services: Services, mission_id: str, file: ReceivedFile, telemetry: 
 def _keep(
     services: Services, mission_id: str, file: ReceivedFile, header: PhotoHeader, telemetry: Any
 ) -> UploadedFrame:
-    known = _known(services, mission_id, file.frame_id)
-    if known is not None and known.reason_code not in NOT_ITS_FAULT:
+    with services.db.read() as tx:
+        known = frames.uploaded(tx, mission_id, file.frame_id)
+    if known is not None and known.code not in NOT_ITS_FAULT:
         return _uploaded(known, file, created=False)
     assert file.path is not None  # the probe refuses what is larger than the limit
     services.store.put_file(f"missions/{mission_id}/photos/{file.frame_id}", file.path)
     if known is not None:
         return _tried_again(services, mission_id, file)
     with services.db.write() as tx:
-        frame, created = frames.receive(
+        there, created = frames.receive(
             tx, mission_id, file.frame_id, file.name, file.size_bytes, header.media_type, header.width,
             header.height, telemetry,
         )  # fmt: skip
     if created:
         services.send("ingest", mission_id, file.frame_id)
-    return _uploaded(frame, file, created)
+    return _uploaded(there, file, created)
 
 
 def _tried_again(services: Services, mission_id: str, file: ReceivedFile) -> UploadedFrame:
     """A photo that could not be read for a reason of ours has another try when it is sent again."""
     with services.db.write() as tx:
         again = frames.retry(tx, mission_id, file.frame_id)
-        frame = frames.get(tx, mission_id, file.frame_id)
-        result = _uploaded(frame, file, created=False)
+        there = frames.uploaded(tx, mission_id, file.frame_id)
     if again:
         services.send("ingest", mission_id, file.frame_id)
-    return result
+    assert there is not None  # it was a moment ago, and only its mission goes
+    return _uploaded(there, file, created=False)
 
 
 def _probe(services: Services, file: ReceivedFile) -> PhotoHeader:
@@ -229,24 +229,14 @@ def _probe(services: Services, file: ReceivedFile) -> PhotoHeader:
     return probe(file.path.read_bytes(), limits)
 
 
-def _known(services: Services, mission_id: str, frame_id: str) -> Frame | None:
-    """The frame if it is here already with its bytes; one that was refused at upload has none."""
-    with services.db.read() as tx:
-        try:
-            frame = frames.get(tx, mission_id, frame_id)
-        except FrameNotFound:
-            return None
-    return None if frame.media_type is None else frame
-
-
-def _uploaded(frame: Frame, file: ReceivedFile, created: bool) -> UploadedFrame:
+def _uploaded(there: Upload, file: ReceivedFile, created: bool) -> UploadedFrame:
     return UploadedFrame(
         name=file.name,
-        frame_id=frame.id,
-        state=cast(FrameState, frame.state),
+        frame_id=there.frame_id,
+        state=cast(FrameState, there.state),
         created=created,
-        code=frame.reason_code,
-        detail=frame.reason,
+        code=there.code,
+        detail=there.reason,
     )
 
 

@@ -5,23 +5,31 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import bindparam, insert, select, update
 from sqlalchemy.orm import Session
 
-from services.catalog.rows import clock, lock
-from services.tables import Event
+from services.catalog.rows import MISSION, clock, hold, in_step, table
+from services.tables import Event, Mission
+
+_NEXT = (
+    update(table(Mission))
+    .where(MISSION.id == bindparam("mission"))
+    .values(event_seq=MISSION.event_seq + 1)
+    .returning(MISSION.event_seq)
+)
+_INSERT = insert(table(Event))
 
 
 def append(
     tx: Session, mission_id: str, kind: str, payload: Mapping[str, Any], now: float | None = None
 ) -> int:
     """Write one event; its number, one more than the last one's of the mission."""
-    mission = lock(tx, mission_id)
-    mission.event_seq += 1
-    tx.add(
-        Event(mission_id=mission_id, seq=mission.event_seq, kind=kind, payload=dict(payload), at=clock(now))
-    )
-    return mission.event_seq
+    hold(tx, mission_id)
+    seq: int = tx.execute(_NEXT, {"mission": mission_id}).scalar_one()
+    event = {"mission_id": mission_id, "seq": seq, "kind": kind, "payload": dict(payload), "at": clock(now)}
+    tx.execute(_INSERT, event)
+    in_step(tx, mission_id, event_seq=seq)
+    return seq
 
 
 def append_frames(

@@ -8,15 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, func, or_, select, tuple_, update
+from sqlalchemy import ColumnElement, and_, bindparam, func, or_, select, tuple_, update
 from sqlalchemy.orm import InstrumentedAttribute, Session
+from sqlalchemy.sql.dml import ReturningInsert
 
 from core.errors import OrthostreamError, PhotoLost
 from core.frame import FrameMeta
 from services.catalog import events, sharpening
-from services.catalog.rows import chunks, clock, insert, lock
+from services.catalog.rows import MISSION, chunks, clock, hold, insert_into, lock, table
 from services.catalog.wakes import Wake
 from services.errors import FrameNotFound
 from services.tables import Frame, Mission
@@ -30,6 +32,40 @@ WHY_WAITING = (
     "map as soon as another photo ties it in."
 )
 _WAKES_AT_ONCE = 200
+
+_FRAME = table(Frame).c
+_ONE = (_FRAME.mission_id == bindparam("mission")) & (_FRAME.id == bindparam("frame"))
+_UPLOADED = select(_FRAME.state, _FRAME.reason_code, _FRAME.reason).where(
+    _ONE, _FRAME.media_type.is_not(None)
+)
+_BEGIN = (
+    update(table(Frame))
+    .where(_ONE, _FRAME.state == "received")
+    .values(attempts=_FRAME.attempts + 1)
+    .returning(_FRAME.attempts, _FRAME.telemetry)
+)
+_ADVANCE = update(table(Frame)).where(_ONE, _FRAME.state == bindparam("before")).returning(_FRAME.id)
+_BEFORE_IT_CAME = select(MISSION.state, MISSION.first_upload_at, MISSION.final_generation).where(
+    MISSION.id == bindparam("mission")
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """At reading a photo: the how manieth it is, and what was sent along with the photo."""
+
+    number: int
+    telemetry: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """A photo that is here, as whoever uploads it is told."""
+
+    frame_id: str
+    state: str
+    code: str | None = None
+    reason: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +89,12 @@ def receive(
     height: int,
     telemetry: Mapping[str, Any] | None = None,
     now: float | None = None,
-) -> tuple[Frame, bool]:
-    """The frame's row, and whether it is new. A new one opens a final mission again.
+) -> tuple[Upload, bool]:
+    """What is there now, and whether it is new. A new one opens a final mission again.
 
     Raises MissionNotFound. Put the photo's bytes into the store before this transaction commits.
     """
-    mission = lock(tx, mission_id)
+    hold(tx, mission_id)
     now = clock(now)
     created = _insert(
         tx,
@@ -75,9 +111,10 @@ def receive(
         attempts=0,
     )
     if created:
-        _reopen(tx, mission, now)
+        _reopen(tx, mission_id, now)
         events.append_frames(tx, mission_id, "received", [frame_id], now)
-    return get(tx, mission_id, frame_id), created
+        return Upload(frame_id, "received"), True
+    return _upload(get(tx, mission_id, frame_id)), False
 
 
 def record_rejected_upload(
@@ -90,7 +127,7 @@ def record_rejected_upload(
     now: float | None = None,
 ) -> Frame:
     """Remember an upload that was refused before it was stored, with the reason its uploader was told."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     now = clock(now)
     created = _insert(
         tx,
@@ -109,27 +146,27 @@ def record_rejected_upload(
     return get(tx, mission_id, frame_id)
 
 
-def begin(tx: Session, mission_id: str, frame_id: str) -> int:
-    """Count one more attempt at reading the photo; the number of attempts so far, this one included.
+def uploaded(tx: Session, mission_id: str, frame_id: str) -> Upload | None:
+    """The photo if it is here already with its bytes; one that was refused at upload has none."""
+    row = tx.execute(_UPLOADED, {"mission": mission_id, "frame": frame_id}).first()
+    return None if row is None else Upload(frame_id, *row)
+
+
+def begin(tx: Session, mission_id: str, frame_id: str) -> Attempt | None:
+    """Count one more attempt at reading the photo; None when it was read already. Raises FrameNotFound.
 
     A photo that kills its reader is found again and again: whoever sees the number grow rejects it.
     """
-    lock(tx, mission_id)
-    count = tx.scalar(
-        update(Frame)
-        .where(Frame.mission_id == mission_id, Frame.id == frame_id)
-        .values(attempts=Frame.attempts + 1)
-        .returning(Frame.attempts)
-        .execution_options(synchronize_session=False)
-    )
-    if count is None:
-        raise FrameNotFound(f"Mission {mission_id!r} has no frame {frame_id!r}.")
-    return count
+    hold(tx, mission_id)
+    row = tx.execute(_BEGIN, {"mission": mission_id, "frame": frame_id}).first()
+    if row is None:
+        get(tx, mission_id, frame_id)
+    return None if row is None else Attempt(*row)
 
 
 def forgive(tx: Session, mission_id: str, frame_id: str) -> None:
     """Forget the attempts at reading the photo: they ended for a reason that is not the photo's."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     row = (Frame.mission_id == mission_id) & (Frame.id == frame_id)
     tx.execute(update(Frame).where(row).values(attempts=0).execution_options(synchronize_session=False))
 
@@ -151,7 +188,7 @@ def mark_rejected(
     tx: Session, mission_id: str, frame_id: str, code: str, reason: str, now: float | None = None
 ) -> bool:
     """Received or ready → rejected, because the photo itself is no good. False when that was decided."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     now = clock(now)
     changed = _set(
         tx,
@@ -166,7 +203,7 @@ def mark_rejected(
 
 def mark_lost(tx: Session, mission_id: str, frame_id: str, now: float | None = None) -> bool:
     """Any state → rejected, because the photo's file is gone; it is no longer among `sightings`."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     lost = {"state": "rejected", "reason_code": PhotoLost.code, "reason": str(PhotoLost())}
     values = lost | {"matched_at": None, "island": None}
     changed = _set(tx, mission_id, [frame_id], tuple(s for s in STATES if s != "rejected"), values)
@@ -178,7 +215,7 @@ def mark_posed(
     tx: Session, mission_id: str, frame_ids: Iterable[str], now: float | None = None
 ) -> Sequence[str]:
     """Matched → posed; so is one that could not be placed before. The ids that changed."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     now = clock(now)
     values = {"state": "posed", "posed_at": now, "reason_code": None, "reason": None, "island": None}
     changed = _set(tx, mission_id, sorted(frame_ids), ("matched", WAITING), values, or_unplaced=True)
@@ -195,7 +232,7 @@ def mark_unplaced(
 
     Such a frame stays among `sightings`: more photos may tie it in after all.
     """
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     now = clock(now)
     changed: Sequence[str] = []
     for code, reason in sorted(set(reasons.values())):
@@ -211,7 +248,7 @@ def mark_waiting(
     tx: Session, mission_id: str, islands: Mapping[str, Mapping[str, Any] | None], now: float | None = None
 ) -> Sequence[str]:
     """matched, posed, fused or unplaced → waiting, each with its pose on its island. The ids that changed."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     values = {"state": WAITING, "reason_code": WAITING, "reason": WHY_WAITING}
     states = ("matched", "posed", "fused")
     changed = _set(tx, mission_id, sorted(islands), states, values, or_unplaced=True)
@@ -232,13 +269,13 @@ def retry(tx: Session, mission_id: str, frame_id: str, now: float | None = None)
 
     A final mission is open again.
     """
-    mission = lock(tx, mission_id)
+    hold(tx, mission_id)
     row = get(tx, mission_id, frame_id)
     if row.state != "rejected" or row.reason_code not in NOT_ITS_FAULT:
         return False
     row.state, row.reason_code, row.reason, row.attempts, row.woken_at = "received", None, None, 0, None
     tx.flush()
-    _reopen(tx, mission, clock(now))
+    _reopen(tx, mission_id, clock(now))
     events.append_frames(tx, mission_id, "received", [frame_id], now)
     return True
 
@@ -353,11 +390,23 @@ def _overdue(
 
 
 def _insert(tx: Session, **values: Any) -> bool:
-    statement = insert(tx, Frame).values(values).on_conflict_do_nothing().returning(Frame.id)
-    return tx.execute(statement).first() is not None
+    return tx.execute(_insert_into(tx.get_bind().dialect.name), values).first() is not None
 
 
-def _reopen(tx: Session, mission: Mission, now: float) -> None:
+@lru_cache
+def _insert_into(dialect: str) -> ReturningInsert[tuple[str]]:
+    return insert_into(dialect, Frame).on_conflict_do_nothing().returning(_FRAME.id)
+
+
+def _upload(row: Frame) -> Upload:
+    return Upload(row.id, row.state, row.reason_code, row.reason)
+
+
+def _reopen(tx: Session, mission_id: str, now: float) -> None:
+    state, first_upload_at, final_generation = tx.execute(_BEFORE_IT_CAME, {"mission": mission_id}).one()
+    if state not in ("final", "sharpening") and first_upload_at and final_generation is None:
+        return  # as with nearly every photo
+    mission = lock(tx, mission_id)
     mission.first_upload_at = mission.first_upload_at or now
     mission.final_generation = None  # what was solved as final lacks this frame
     if mission.state in ("final", "sharpening"):
@@ -376,12 +425,13 @@ def _advance(
     values: dict[str, Any],
     now: float | None,
 ) -> bool:
-    lock(tx, mission_id)
-    changed = _set(tx, mission_id, [frame_id], (before,), {"state": after, **values})
-    if not changed:
+    hold(tx, mission_id)
+    which = {"mission": mission_id, "frame": frame_id, "before": before}
+    if tx.execute(_ADVANCE, {**which, "state": after, **values}).first() is None:
         get(tx, mission_id, frame_id)  # FrameNotFound for one that never was
-    events.append_frames(tx, mission_id, after, changed, now)
-    return bool(changed)
+        return False
+    events.append_frames(tx, mission_id, after, [frame_id], now)
+    return True
 
 
 def _set(

@@ -6,13 +6,13 @@ import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import ColumnElement, exists, func, select, tuple_
+from sqlalchemy import ColumnElement, bindparam, exists, func, select, tuple_, update
 from sqlalchemy import delete as delete_rows
 from sqlalchemy.orm import Session
 
 from core.scale import UNKNOWN, KnownScale
 from services.catalog import events, frames, leases, sharpening, tiles
-from services.catalog.rows import clock, lock, mission
+from services.catalog.rows import MISSION, clock, hold, in_step, lock, mission, table
 from services.catalog.wakes import Wake
 from services.tables import DirtyTile, Frame, Mission, Tile
 
@@ -20,6 +20,9 @@ _ALPHABET = "abcdefghijkmnpqrstuvwxyz23456789"  # no l, o, 0, 1: ids are read ou
 _RATE_WINDOW_S = 30.0
 _ENDING = ("finalising", "sharpening")
 _UNDER_WAY = ("open", *_ENDING)
+
+_SPENT = select(MISSION.stage_seconds).where(MISSION.id == bindparam("mission"))
+_SPEND = update(table(Mission)).where(MISSION.id == bindparam("mission"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +188,11 @@ def purge(tx: Session, mission_id: str) -> None:
 
 def spend(tx: Session, mission_id: str, stage: str, seconds: float) -> None:
     """Add to the seconds of work that a stage took, all workers together."""
-    row = lock(tx, mission_id)
-    row.stage_seconds = row.stage_seconds | {stage: row.stage_seconds.get(stage, 0.0) + seconds}
+    hold(tx, mission_id)
+    spent = tx.execute(_SPENT, {"mission": mission_id}).scalar_one()
+    spent = spent | {stage: spent.get(stage, 0.0) + seconds}
+    tx.execute(_SPEND, {"mission": mission_id, "stage_seconds": spent})
+    in_step(tx, mission_id, stage_seconds=spent)
 
 
 def count_pixels(tx: Session, mission_id: str, pixels: Mapping[str, int]) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Iterator, Sequence
+from functools import lru_cache
 from itertools import islice
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
-from sqlalchemy import Table, inspect
+from sqlalchemy import Table, bindparam, inspect, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
+from sqlalchemy.orm.attributes import set_committed_value
 
 from services.errors import MissionNotFound
 from services.tables import Base, Mission
@@ -46,16 +48,49 @@ def lock(tx: Session, mission_id: str) -> Mission:
     return held[mission_id]
 
 
+def hold(tx: Session, mission_id: str) -> None:
+    """As `lock`, for those who need nothing of the row but that nobody else writes to its mission."""
+    held: set[str] = tx.info.setdefault("held_missions", set())
+    if mission_id in tx.info.get("locked_missions", ()):
+        lock(tx, mission_id)
+    elif mission_id not in held:
+        state = tx.execute(_STATE, {"id": mission_id}).scalar()
+        if state is None:
+            raise MissionNotFound(f"There is no mission {mission_id!r}.")
+        if state == "deleting":
+            raise MissionNotFound(f"The mission {mission_id!r} was deleted.")
+        held.add(mission_id)
+
+
+def in_step(tx: Session, mission_id: str, **values: Any) -> None:
+    """Tells the mission's object, if this transaction has one, what was written past it."""
+    row = tx.identity_map.get(inspect(Mission).identity_key_from_primary_key((mission_id,)))
+    for name, value in values.items() if row is not None else ():
+        set_committed_value(row, name, value)
+
+
 def table(model: type[Base]) -> Table:
-    """The Core table of a model, for bulk statements that need no objects."""
+    """The Core table of a model, for statements that need no objects."""
     return cast(Table, inspect(model).local_table)
 
 
-def insert(tx: Session, model: type[Base]) -> postgresql.Insert:
+# What every photo passes is said once and compiled once: objects and fresh statements take several times as
+# long as the database itself.
+MISSION = table(Mission).c
+_STATE = select(MISSION.state).where(MISSION.id == bindparam("id")).with_for_update()
+
+
+@lru_cache
+def insert_into(dialect: str, model: type[Base]) -> postgresql.Insert:
     """An INSERT that knows ON CONFLICT; both dialects spell it alike, so it is typed as one of them."""
-    if tx.get_bind().dialect.name == "sqlite":
+    if dialect == "sqlite":
         return cast(postgresql.Insert, sqlite.insert(table(model)))
     return postgresql.insert(table(model))
+
+
+def insert(tx: Session, model: type[Base]) -> postgresql.Insert:
+    """An INSERT that knows ON CONFLICT, in the words of this transaction's database."""
+    return insert_into(tx.get_bind().dialect.name, model)
 
 
 def chunks(items: Collection[T]) -> Iterator[Sequence[T]]:
