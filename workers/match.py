@@ -40,10 +40,10 @@ def match(mission_id: str, frame_id: str | None, wanted: Sequence[Key] = ()) -> 
             send("sequence", mission_id)
             return
         wanted = neighbours(mission_id, seen, frame_id) if mode == "visual" else []
-    with db.write() as tx:
+    with db.write(durable=False) as tx:
         mine = pairs.claim(tx, mission_id, frame_id, [(a, b) for a, b in wanted])
     results = [computed(mission_id, seen, pair) for pair in mine]
-    with db.write() as tx:
+    with db.write(durable=False) as tx:
         pairs.record(tx, mission_id, results)
         if frame_id is not None:
             frames.mark_matched(tx, mission_id, frame_id)

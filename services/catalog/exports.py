@@ -8,7 +8,7 @@ from sqlalchemy import func, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from services.catalog import events
-from services.catalog.rows import clock, lock
+from services.catalog.rows import clock, hold, lock
 from services.catalog.wakes import Wake
 from services.tables import Export, Frame, Mission, Survey
 
@@ -106,7 +106,7 @@ def _is_good(tx: Session, mission: Mission, export: Export) -> bool:
 def _end(
     tx: Session, mission_id: str, name: str, revision: int, now: float | None, **values: str | int
 ) -> bool:
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     now = clock(now)
     export = get(tx, mission_id, name)
     if export is None or export.state != "wanted" or export.revision != revision:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from services.catalog.rows import clock, lock
+from services.catalog.rows import clock, hold
 from services.errors import LeaseLost
 from services.tables import Lease
 
@@ -17,7 +17,7 @@ def acquire(tx: Session, mission_id: str, owner: str, ttl_s: float, now: float |
 
     `owner` names one run of one process; whoever holds the lease does not get it a second time.
     """
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     now = clock(now)
     lease = _read(tx, mission_id)
     if lease is None:
@@ -33,7 +33,7 @@ def renew(
     tx: Session, mission_id: str, owner: str, epoch: int, ttl_s: float, now: float | None = None
 ) -> bool:
     """Hold on for another `ttl_s`; False when somebody else has taken over."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     lease = _read(tx, mission_id)
     if lease is None or (lease.owner, lease.epoch) != (owner, epoch):
         return False
@@ -43,7 +43,7 @@ def renew(
 
 def release(tx: Session, mission_id: str, owner: str, epoch: int) -> None:
     """Let go, so that the next one need not wait; nothing happens when the lease is another's."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     lease = _read(tx, mission_id)
     if lease is not None and (lease.owner, lease.epoch) == (owner, epoch):
         lease.owner, lease.expires_at = _NOBODY, 0.0
@@ -54,7 +54,7 @@ def guard(tx: Session, mission_id: str, epoch: int) -> None:
 
     A lease that ran out while nobody took it still holds: only a newer epoch or a release ends it.
     """
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     lease = _read(tx, mission_id)
     if lease is None or lease.epoch != epoch or lease.owner == _NOBODY:
         raise LeaseLost()

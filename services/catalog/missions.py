@@ -22,7 +22,8 @@ _ENDING = ("finalising", "sharpening")
 _UNDER_WAY = ("open", *_ENDING)
 
 _SPENT = select(MISSION.stage_seconds).where(MISSION.id == bindparam("mission"))
-_SPEND = update(table(Mission)).where(MISSION.id == bindparam("mission"))
+_PIXELS = select(MISSION.pixels).where(MISSION.id == bindparam("mission"))
+_CHANGE = update(table(Mission)).where(MISSION.id == bindparam("mission"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,15 +192,17 @@ def spend(tx: Session, mission_id: str, stage: str, seconds: float) -> None:
     hold(tx, mission_id)
     spent = tx.execute(_SPENT, {"mission": mission_id}).scalar_one()
     spent = spent | {stage: spent.get(stage, 0.0) + seconds}
-    tx.execute(_SPEND, {"mission": mission_id, "stage_seconds": spent})
+    tx.execute(_CHANGE, {"mission": mission_id, "stage_seconds": spent})
     in_step(tx, mission_id, stage_seconds=spent)
 
 
 def count_pixels(tx: Session, mission_id: str, pixels: Mapping[str, int]) -> None:
     """Add to the pixels that were rendered: of new ground, to heal, by the final pass, to sharpen."""
-    row = lock(tx, mission_id)
-    more = {kind: row.pixels.get(kind, 0) + n for kind, n in pixels.items() if n}
-    row.pixels = row.pixels | more
+    hold(tx, mission_id)
+    so_far = tx.execute(_PIXELS, {"mission": mission_id}).scalar_one()
+    more = {kind: so_far.get(kind, 0) + n for kind, n in pixels.items() if n}
+    tx.execute(_CHANGE, {"mission": mission_id, "pixels": so_far | more})
+    in_step(tx, mission_id, pixels=so_far | more)
 
 
 def progress(tx: Session, mission_id: str, now: float | None = None) -> Progress:

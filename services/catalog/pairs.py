@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import func, or_, select, tuple_
 from sqlalchemy.orm import Session
 
-from services.catalog.rows import chunks, insert, lock
+from services.catalog.rows import chunks, hold, insert
 from services.tables import Pair
 
 Key = tuple[str, str]
@@ -58,7 +58,7 @@ def claim(tx: Session, mission_id: str, proposer: str | None, pairs: Iterable[Ke
     pairs again. None is the final solve, which no frame outlives: it also takes over the unfinished pairs
     of others. Pairs come back as (low, high), sorted.
     """
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     keys = sorted({(min(a, b), max(a, b)) for a, b in pairs if a != b})
     rows = [
         {
@@ -84,7 +84,7 @@ def claim(tx: Session, mission_id: str, proposer: str | None, pairs: Iterable[Ke
 
 def record(tx: Session, mission_id: str, results: Collection[PairResult]) -> None:
     """Store results. A pair that has one keeps it: the second run of a task changes nothing."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     rows = [
         {
             "mission_id": mission_id,

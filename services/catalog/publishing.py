@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
-from services.catalog.rows import clock, lock
+from services.catalog.rows import clock, hold, lock
 from services.errors import RevisionConflict
 from services.tables import DirtyTile
 
@@ -32,7 +32,7 @@ def claim(
 
 def release(tx: Session, mission_id: str, claimed_at: float) -> None:
     """End a claim: its tiles are published, or were not."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     ours = (DirtyTile.mission_id == mission_id, DirtyTile.claimed_at == claimed_at)
     statement = update(DirtyTile).where(*ours).values(claimed_at=None)
     tx.execute(statement.execution_options(synchronize_session=False))

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from core.checkpoints import Checkpoints, parse_gcp_list
 from services.catalog import missions
-from services.catalog.rows import clock, lock, mission
+from services.catalog.rows import clock, hold, lock, mission
 from services.tables import Survey
 
 
@@ -51,7 +51,7 @@ def checkpoints(tx: Session, mission_id: str) -> Checkpoints | None:
 
 def keep_measured(tx: Session, mission_id: str, content: str | None, measured: Mapping[str, Any]) -> None:
     """Remember what was found of the points in the mosaic, unless other points (`content`) came meanwhile."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     row = get(tx, mission_id)
     if row is not None and row.content == content:
         row.measured = dict(measured)

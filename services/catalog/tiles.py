@@ -27,7 +27,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import Session
 
 from services.catalog import events
-from services.catalog.rows import chunks, clock, insert, lock, mission, table
+from services.catalog.rows import chunks, clock, hold, insert, lock, mission, table
 from services.errors import RevisionConflict
 from services.tables import DirtyTile, Frame, FramePose, Tile, TileVersion
 
@@ -98,7 +98,7 @@ def mark_dirty(
     priority: int = GROWN,
 ) -> None:
     """These tiles show poses older than `generation`. `tiles` may map each to its own priority, 0 first."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     priorities = dict(tiles) if isinstance(tiles, Mapping) else dict.fromkeys(tiles, priority)
     rows = [
         {
@@ -139,7 +139,7 @@ def claim_dirty(
     At most `limit_tiles`, or one block of siblings when the limit is smaller than that. Of equal priority,
     the longest waiting come first; `by_place`: neighbours, which share their photos, along strips four high.
     """
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     now = clock(now)
     free = _claimable(mission_id, ttl_s, now)
     block = _block()
@@ -163,7 +163,7 @@ def claim_dirty(
 
 def record_renders(tx: Session, mission_id: str, renders: Collection[Render]) -> None:
     """Keep what was rendered until it is published; a render older than the one kept is dropped."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     dirty = table(DirtyTile)
     older = or_(
         dirty.c.rendered_generation.is_(None), dirty.c.rendered_generation < bindparam("new_generation")
@@ -232,7 +232,7 @@ def publish(
 
 def fuse_frames(tx: Session, mission_id: str, now: float | None = None) -> Sequence[str]:
     """Posed → fused for the frames whose tiles show them; their ids."""
-    lock(tx, mission_id)
+    hold(tx, mission_id)
     now = clock(now)
     missing = exists().where(
         DirtyTile.mission_id == FramePose.mission_id,
