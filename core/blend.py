@@ -35,14 +35,13 @@ OTHER_GROUND = 0.03
 class Layer(NamedTuple):
     """One warped photo, whose top-left corner is a cell of the lattice.
 
-    `levels`: its Gaussian levels, finest first, (h >> l, w >> l, 3) uint8. `gain`: (3,) float32.
+    `levels`: its Gaussian levels, finest first, (h >> l, w >> l, 3) uint8.
     """
 
     label: int
     row: int
     col: int
     levels: list[Rgb]
-    gain: NDArray[np.float32]
 
 
 def gaussian_levels(warped: Rgb, bands: int) -> list[Rgb]:
@@ -80,7 +79,7 @@ def blend_level(
     out = np.zeros((*labels.shape, 3), np.float32)
     for layer in layers:
         change = _changes(coarse, coarse_labels, layer, level + 1, cell_px)
-        _apply(change, *_rows(layer, level), layer.label, labels, *_corner(layer, level, cell_px), out)
+        _apply(change, _rows(layer, level), layer.label, labels, *_corner(layer, level, cell_px), out)
     return out
 
 
@@ -91,14 +90,13 @@ def blend_finest(
     out = np.zeros(labels.shape, "<u4")
     for layer in layers:
         change = _changes(coarse, coarse_labels, layer, 1, cell_px)
-        _paint(change, *_rows(layer, 0), layer.label, labels, *_corner(layer, 0, cell_px), out)
+        _paint(change, _rows(layer, 0), layer.label, labels, *_corner(layer, 0, cell_px), out)
     return out.view(np.uint8).reshape(*labels.shape, 4)
 
 
-def _rows(layer: Layer, level: int) -> tuple[Flat8, Row]:
-    """A layer's level as flat rows, three numbers a pixel, and the gain of such a row."""
-    height, width = layer.levels[level].shape[:2]
-    return layer.levels[level].reshape(height, 3 * width), np.tile(layer.gain, width)
+def _rows(layer: Layer, level: int) -> Flat8:
+    """A layer's level as flat rows, three numbers a pixel."""
+    return layer.levels[level].reshape(len(layer.levels[level]), -1)
 
 
 def _corner(layer: Layer, level: int, cell_px: int) -> tuple[int, int]:
@@ -108,10 +106,10 @@ def _corner(layer: Layer, level: int, cell_px: int) -> tuple[int, int]:
 
 def _changes(coarse: Fine, coarse_labels: Labels, layer: Layer, level: int, cell_px: int) -> Flat:
     """How the blended colours differ from one photo's own, as flat rows."""
-    photo, gain = _rows(layer, level)
+    photo = _rows(layer, level)
     out = np.empty(photo.shape, np.float32)
     flat = coarse.reshape(len(coarse), -1)
-    _difference(flat, coarse_labels, photo, gain, *_corner(layer, level, cell_px), out)
+    _difference(flat, coarse_labels, photo, *_corner(layer, level, cell_px), out)
     return out
 
 
@@ -261,14 +259,12 @@ def _label(
 
 
 @compiled
-def _difference(
-    coarse: Flat, labels: Labels, photo: Flat8, gain: Row, top: int, left: int, out: Flat
-) -> None:
+def _difference(coarse: Flat, labels: Labels, photo: Flat8, top: int, left: int, out: Flat) -> None:
     # Whole arrays and offsets, not slices: these stay contiguous: one compiled version, and vector code.
     for y in range(photo.shape[0]):
         here, own, change = coarse[top + y, 3 * left : 3 * left + photo.shape[1]], photo[y], out[y]
         for i in range(len(own)):
-            change[i] = here[i] - own[i] * gain[i]
+            change[i] = here[i] - np.float32(own[i])
         # Where nobody is, nothing pulls: or the mosaic's border would fade into black.
         for x in range(photo.shape[1] // 3):
             if labels[top + y, left + x] < 0:
@@ -276,10 +272,8 @@ def _difference(
 
 
 @compiled
-def _blended_row(
-    change: Flat, photo: Flat8, gain: Row, y: int, start: int, stop: int, scratch: Flat, line: Row
-) -> None:
-    """Row y of photo · gain + change doubled in size, for pixels start … stop − 1, both even, into `line`.
+def _blended_row(change: Flat, photo: Flat8, y: int, start: int, stop: int, scratch: Flat, line: Row) -> None:
+    """Row y of photo + change doubled in size, for pixels start … stop − 1, both even, into `line`.
 
     Rows are flat, three numbers a pixel; plain loops over equal slices, which compile to vector code.
     """
@@ -304,13 +298,13 @@ def _blended_row(
     for i in range(len(here)):
         even[i] = (three * here[i] + left[i]) * sixteenth
         odd[i] = (three * here[i] + right[i]) * sixteenth
-    out, own, by = line[2 * first : 2 * last], photo[y, 2 * first : 2 * last], gain[2 * first : 2 * last]
+    out, own = line[2 * first : 2 * last], photo[y, 2 * first : 2 * last]
     for x in range(len(even) // 3):
         for c in range(3):
             out[6 * x + c] = even[3 * x + c]
             out[6 * x + 3 + c] = odd[3 * x + c]
     for i in range(len(out)):
-        out[i] += own[i] * by[i]
+        out[i] += np.float32(own[i])
 
 
 @compiled
@@ -325,15 +319,13 @@ def _span(names: NDArray[np.int16], label: int) -> tuple[int, int]:
 
 
 @compiled
-def _apply(
-    change: Flat, photo: Flat8, gain: Row, label: int, labels: Labels, top: int, left: int, out: Fine
-) -> None:
+def _apply(change: Flat, photo: Flat8, label: int, labels: Labels, top: int, left: int, out: Fine) -> None:
     scratch, line = np.empty((3, change.shape[1] + 6), np.float32), np.empty(photo.shape[1], np.float32)
     for y in range(photo.shape[0]):
         start, stop = _span(labels[top + y, left : left + photo.shape[1] // 3], label)
         if start == stop:
             continue
-        _blended_row(change, photo, gain, y, start, stop, scratch, line)
+        _blended_row(change, photo, y, start, stop, scratch, line)
         for x in range(start, stop):
             if labels[top + y, left + x] == label:
                 for c in range(3):
@@ -344,7 +336,6 @@ def _apply(
 def _paint(
     change: Flat,
     photo: Flat8,
-    gain: Row,
     label: int,
     labels: Labels,
     top: int,
@@ -359,7 +350,7 @@ def _paint(
         start, stop = _span(labels[top + y, left : left + photo.shape[1] // 3], label)
         if start == stop:
             continue
-        _blended_row(change, photo, gain, y, start, stop, scratch, line)
+        _blended_row(change, photo, y, start, stop, scratch, line)
         values, rounded = line[3 * start : 3 * stop], bytes_[3 * start : 3 * stop]
         for i in range(len(values)):
             rounded[i] = np.uint8(np.int32(min(max(values[i], dark), bright) + half))

@@ -1,8 +1,8 @@
 """Exposure, white balance and vignetting, balanced over the overlaps of the frames.
 
-Where two photos see the same ground, the logarithms of their colours may differ only by their gains and by
-their lens's falloff. Robust least squares over ground points, whose brightness is eliminated; gains are held
-near 1.
+Where two photos see the same ground, the logarithms of their light (`core.tone`) may differ only by their
+gains and by their lens's falloff. Robust least squares over ground points, whose brightness is eliminated;
+gains are held near 1, so that the map as a whole gets neither brighter nor darker.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from core.geometry import Array, PosedFrame, World
+from core.tone import Gain, log_light
 
-Gain = tuple[float, float, float]
 Thumb = NDArray[np.uint8]
 Index = NDArray[np.int64]
 
@@ -29,17 +29,18 @@ class ExposureParams:
 
     `side_px`: photos are shrunk to this before their colours are compared; `points_per_side`: ground points
     across a median footprint. `darkest`, `brightest`: grey levels between which a colour is trusted. In
-    logarithms: `noise` of one comparison and `outlier` beyond which it fades, the `gain_sigma` around 1 and
-    the `falloff_sigma` around a perfect lens.
+    logarithms: `noise` of one comparison; `outlier` beyond which it fades in the end, `doubt` at first, when
+    nobody's gain is known; the `gain_sigma` around 1 and the `falloff_sigma` around a perfect lens.
     """
 
     side_px: int = 32
-    points_per_side: int = 10
+    points_per_side: int = 16
     darkest: float = 6.0
     brightest: float = 248.0
     noise: float = 0.25
-    outlier: float = 0.08
-    gain_sigma: float = 0.1
+    outlier: float = 0.3
+    doubt: float = 1.0
+    gain_sigma: float = 0.5
     falloff_sigma: float = 0.3
     iterations: int = 8
 
@@ -133,7 +134,7 @@ def _sighting(
     good = ((colour > params.darkest) & (colour < params.brightest)).all(1)
     away = (uv[inside][good] - (camera.cx, camera.cy)) ** 2
     rho2 = 4 * away.sum(1) / (camera.width**2 + camera.height**2)
-    return np.full(int(good.sum()), k), cells[inside][good], np.log(colour[good]), rho2
+    return np.full(int(good.sum()), k), cells[inside][good], log_light(colour[good]), rho2
 
 
 def _bilinear(image: Array, xy: Array) -> Array:
@@ -146,7 +147,7 @@ def _bilinear(image: Array, xy: Array) -> Array:
 
 
 def _solve(seen: _Sightings, lens: Index, lenses: int, params: ExposureParams) -> tuple[Array, Array]:
-    """Gains (N, 3) and falloffs (C, 9): log colour = point − log gain + falloff, iteratively reweighted."""
+    """Gains (N, 3) and falloffs (C, 9): log light = point − log gain + falloff, iteratively reweighted."""
     n, m = len(lens), len(seen.frame)
     powers = np.column_stack((seen.rho2, seen.rho2**2, seen.rho2**3))
     at = n + 3 * lens[seen.frame]
@@ -158,12 +159,13 @@ def _solve(seen: _Sightings, lens: Index, lenses: int, params: ExposureParams) -
     prior = np.full(n + 3 * lenses, params.falloff_sigma**-2)
     prior[:n] = params.gain_sigma**-2
     answer, weight = np.zeros((n + 3 * lenses, 3)), np.ones(m)
-    for _ in range(params.iterations):
+    for turn in range(params.iterations):
         answer = _least_squares(design, points, weight / params.noise**2, seen.log, prior)
         left = seen.log - design @ answer
         mean = (points.T @ (weight[:, None] * left)) / (points.T @ weight)[:, None]
         off = ((left - mean[seen.point]) ** 2).mean(1)
-        weight = 1 / (1 + off / params.outlier**2) ** 2
+        scale = max(params.outlier, params.doubt / 2**turn)
+        weight = 1 / (1 + off / scale**2) ** 2
     falloff = answer[n:].reshape(lenses, 3, 3).transpose(0, 2, 1).reshape(lenses, 9)
     # Rounded, so that a sum's last bits never show in a tile.
     return np.asarray(np.round(np.exp(answer[:n]), 5), float), np.round(falloff, 5)

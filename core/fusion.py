@@ -31,6 +31,7 @@ from core.geometry import Array, PosedFrame, World
 from core.grid import Grid
 from core.seams import REACH_CELLS, settle
 from core.sharpness import give_way
+from core.tone import curves, relit, show
 from core.warp import Int32, Lattice, Rgb, Views, knots, look, warp
 
 PAD_CELLS = 2
@@ -221,7 +222,7 @@ def _look(
         loose_px = math.hypot(*frame.pose.sigma_m[:2]) / gsd_m
         importance *= params.loose_px / (params.loose_px + loose_px)
     skirt_px = SKIRT_CELLS * params.cell_px * resolution_m / gsd_m
-    thumb = photos.thumb(frame.frame_id)
+    thumb = relit(photos.thumb(frame.frame_id), frame.gain)
     tone = _shrunk(np.ascontiguousarray(thumb[..., :3]), params.tone_side_px)
     tones = (thumb, tone, _shrunk(tone, params.tone_side_px // 4))
     min_cos_view = math.cos(math.radians(params.max_view_deg))
@@ -277,9 +278,8 @@ def _layer(
         params.cell_px,
         params.sampling == "cubic",
     )
-    return Layer(
-        label, int(top), int(left), gaussian_levels(warped, params.bands), np.array(frame.gain, np.float32)
-    )
+    show(warped, curves(frame.gain), warped)
+    return Layer(label, int(top), int(left), gaussian_levels(warped, params.bands))
 
 
 def _blend(
@@ -290,7 +290,7 @@ def _blend(
         mine = scene.labels == layer.label
         mean = layer.levels[-1]
         window = np.zeros((*labels.shape, 3), np.float32)
-        window[layer.row :, layer.col :][: mean.shape[0], : mean.shape[1]] = mean * layer.gain
+        window[layer.row :, layer.col :][: mean.shape[0], : mean.shape[1]] = mean
         colours[mine] += window[mine]
     for level in range(params.bands - 1, 0, -1):
         finer = label_level(scene.labels, scene.weights, params.cell_px >> level, None, sizes)

@@ -24,8 +24,8 @@ class Camera:
     """A pinhole with radial distortion x_d = x (1 + k1 r² + k2 r⁴), shared by all frames of one body.
 
     Pixels are those of the original photo as the sensor wrote it (EXIF orientation ignored). `falloff`: none,
-    or nine numbers: the logarithm of the lens's brightness is a ρ² + b ρ⁴ + c ρ⁶ with (a, b, c) for red, then
-    green, then blue; ρ = distance from (cx, cy) over half the picture's diagonal.
+    or nine numbers: the logarithm of the light (`core.tone`) that the lens passes is a ρ² + b ρ⁴ + c ρ⁶ with
+    (a, b, c) for red, then green, then blue; ρ = distance from (cx, cy) over half the picture's diagonal.
     """
 
     width: int
@@ -108,7 +108,7 @@ class Pose:
 class PosedFrame:
     """A frame that can be drawn: with the photo's bytes, all that a tile is a function of.
 
-    `gain`: what each colour channel (R, G, B) is multiplied with to balance exposure.
+    `gain`: what each colour channel's (R, G, B) light (`core.tone`) is multiplied with to balance exposure.
     """
 
     frame_id: str

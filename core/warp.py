@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from core.compiled import compiled
 from core.geometry import Camera, PosedFrame, World
 from core.grid import Columns, Grid
+from core.tone import lit
 
 Int16 = NDArray[np.int16]
 Int32 = NDArray[np.int32]
@@ -76,7 +77,7 @@ class Views(NamedTuple):
     """Frames seen from the lattice, (frames, rows, cols); `own`, `even`, `detail` of its inner knots only.
 
     `weight`: int32, 0 where the frame has no say, `INSIDE` … `FULL` inside of its photo. `spot`: (…, 3) int16
-    in 1/16 grey levels, gain applied: how the colours of the smallest things that a knot can tell depart from
+    in 1/16 grey levels: how the colours of the smallest things that a knot can tell depart from
     a much coarser mean. `own`: the photo's local mean colour. `even`: the same without the lens's falloff.
     `detail`: how `own` departs from that much coarser mean. `sharp`: uint8, `core.sharpness`, 0 = unknown.
     """
@@ -147,7 +148,6 @@ def look(
         float(pose.ground_h_m),
         intrinsics(frame.camera),
         *tones,
-        np.array([round(16 * 256 * g) for g in frame.gain], np.int64),
         np.array(frame.camera.falloff or (0.0,) * 9),
         np.array([importance, min_cos_view, skirt_px, _reach_m(frame, skirt_px)]),
         *(column[k] for column in views),
@@ -250,8 +250,8 @@ def _knots(
 
 
 @compiled
-def _sample(image: Rgb, right: float, down: float, gain: NDArray[np.int64], out: NDArray[np.int64]) -> None:
-    """Bilinear, times gain, at shares (0 … 1) of the picture's width and height; in 1/16 grey levels."""
+def _sample(image: Rgb, right: float, down: float, out: NDArray[np.int64]) -> None:
+    """Bilinear at shares (0 … 1) of the picture's width and height; in 1/16 grey levels."""
     x = min(max(right * image.shape[1] - 0.5, 0.0), image.shape[1] - 1.0)
     y = min(max(down * image.shape[0] - 0.5, 0.0), image.shape[0] - 1.0)
     x0, y0 = min(int(x), image.shape[1] - 2), min(int(y), image.shape[0] - 2)
@@ -259,7 +259,7 @@ def _sample(image: Rgb, right: float, down: float, gain: NDArray[np.int64], out:
     for c in range(3):
         upper = int(image[y0, x0, c]) * (256 - fx) + int(image[y0, x0 + 1, c]) * fx
         lower = int(image[y0 + 1, x0, c]) * (256 - fx) + int(image[y0 + 1, x0 + 1, c]) * fx
-        out[c] = ((upper * (256 - fy) + lower * fy) * gain[c] + (1 << 23)) >> 24
+        out[c] = (upper * (256 - fy) + lower * fy + (1 << 11)) >> 12
 
 
 @compiled
@@ -289,7 +289,6 @@ def _look(
     thumb: Rgb,
     fine: Rgb,
     coarse: Rgb,
-    gain: NDArray[np.int64],
     falloff: NDArray[np.float64],
     limits: NDArray[np.float64],
     weight: Int32,
@@ -319,21 +318,21 @@ def _look(
         right, down = (u + 0.5) / width, (v + 0.5) / height
         if thumb.shape[2] > 3 and w >= INSIDE:
             sharp[j, i] = thumb[int(down * thumb.shape[0]), int(right * thumb.shape[1]), 3]
-        _sample(thumb, right, down, gain, least)
-        _sample(coarse, right, down, gain, around)
+        _sample(thumb, right, down, least)
+        _sample(coarse, right, down, around)
         for c in range(3):
-            spot[j, i, c] = min(max(least[c] - around[c], -16000), 16000)
+            spot[j, i, c] = least[c] - around[c]
         j, i = j - rim, i - rim
         if min(j, i) < 0 or j >= own.shape[0] or i >= own.shape[1]:
             continue
-        _sample(fine, right, down, gain, value)
+        _sample(fine, right, down, value)
         rho2 = 4 * ((u - lens[1]) ** 2 + (v - lens[2]) ** 2) / (width * width + height * height)
         for c in range(3):
-            own[j, i, c] = light[j, i, c] = min(value[c], 16000)
-            detail[j, i, c] = min(max(value[c] - around[c], -16000), 16000)
+            own[j, i, c] = light[j, i, c] = value[c]
+            detail[j, i, c] = value[c] - around[c]
             if not bare:
                 dim = rho2 * (falloff[3 * c] + rho2 * (falloff[3 * c + 1] + rho2 * falloff[3 * c + 2]))
-                light[j, i, c] = min(math.floor(value[c] * math.exp(-dim) + 0.5), 16000)
+                light[j, i, c] = math.floor(16 * lit(value[c] / 16, math.exp(-dim)) + 0.5)
 
 
 @compiled

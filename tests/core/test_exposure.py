@@ -25,15 +25,16 @@ def albedo(xy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def thumb(frame: PosedFrame, gain: NDArray[np.float64], falloff: tuple[float, ...] = ()) -> Rgb:
-    """128 × 96 px of what the camera saw, darkened by `gain` and by the lens."""
+    """128 × 96 px of what the camera shows, its light multiplied by `gain` and dimmed by the lens."""
     us, vs = np.meshgrid((np.arange(128) + 0.5) * 12.5 - 0.5, (np.arange(96) + 0.5) * 12.5 - 0.5)
     uv = np.column_stack((us.ravel(), vs.ravel()))
-    colour = albedo(frame.pose.ground(frame.camera, uv)[:, :2]) * gain
+    colour = albedo(frame.pose.ground(frame.camera, uv)[:, :2])
+    light = colour / (256 - colour) * gain
     if falloff:
         rho2 = 4 * ((uv - (CAMERA.cx, CAMERA.cy)) ** 2).sum(1) / (CAMERA.width**2 + CAMERA.height**2)
         powers = np.column_stack((rho2, rho2**2, rho2**3))
-        colour *= np.exp(powers @ np.reshape(falloff, (3, 3)).T)
-    return np.round(np.clip(colour, 0, 255)).astype(np.uint8).reshape(96, 128, 3)
+        light *= np.exp(powers @ np.reshape(falloff, (3, 3)).T)
+    return np.floor(256 * light / (1 + light)).astype(np.uint8).reshape(96, 128, 3)
 
 
 def flight(lines: int = 4, per_line: int = 6) -> list[PosedFrame]:
@@ -57,6 +58,27 @@ def test_exposure_steps_are_found() -> None:
     # All alike may stay brighter or darker: what must go are the differences.
     assert (left - left.mean(0)).std() < 0.15 * (given - given.mean(0)).std()
     assert np.abs(left - left.mean(0)).max() < 0.05
+
+
+def test_a_camera_that_exposes_by_what_it_sees_is_understood() -> None:
+    """Half as much light again over a forest as over a meadow beside it, white balance alike."""
+    frames, rng = flight(5, 8), np.random.default_rng(15)
+    lights = {f.frame_id: np.exp(rng.choice([-0.4, 0.0, 0.4]) + rng.normal(0, 0.1, 3)) for f in frames}
+    thumbs = {f.frame_id: thumb(f, lights[f.frame_id]) for f in frames}
+    gains = balance(frames, WORLD, thumbs)
+    left = np.log([np.multiply(gains[k], lights[k]) for k in sorted(gains)])
+    assert np.abs(left - left.mean(0)).max() < 0.03
+    # anchored: neither brighter nor darker as a whole
+    assert np.log(list(gains.values())).mean(0) == pytest.approx((0, 0, 0), abs=1e-4)
+
+
+def test_tone_does_not_drift_along_a_line() -> None:
+    frames, rng = flight(2, 40), np.random.default_rng(16)
+    lights = {f.frame_id: np.exp(rng.normal(0, 0.2, 3)) for f in frames}
+    gains = balance(frames, WORLD, {f.frame_id: thumb(f, lights[f.frame_id]) for f in frames})
+    left = np.log([np.multiply(gains[f.frame_id], lights[f.frame_id]) for f in frames])
+    ends = left[[0, 1, 40, 41]].mean(0) - left[[38, 39, 78, 79]].mean(0)
+    assert np.abs(ends).max() < 0.05
 
 
 def test_the_falloff_of_the_lens_is_found() -> None:

@@ -286,18 +286,20 @@ def test_tone_flows_over_a_seam() -> None:
     assert np.abs(np.diff(row)).max() <= 2
     assert row[8] == 100
     assert row[-8] == 140
-    balanced = [replace(frames[0], gain=(1.2,) * 3), replace(frames[1], gain=(1.2 / 1.4,) * 3)]
+    gains = [(120 / 136) / (level / (256 - level)) for level in (100.5, 140.5)]
+    balanced = [replace(f, gain=(g,) * 3) for f, g in zip(frames, gains, strict=True)]
     even = render(grid, WORLD, balanced, album)[..., :3].astype(int)
     assert np.abs(even - 120).max() <= 1
 
 
 def test_falloff_of_the_lens_is_lifted() -> None:
-    falloff = (-0.25, -0.1, -0.05) * 3
+    falloff = (-0.5, -0.2, -0.1) * 3
     camera = Camera(360, 270, 760.0, 179.5, 134.5, falloff=falloff)
     ys, xs = np.mgrid[0:270, 0:360]
     rho2 = 4 * ((xs - 179.5) ** 2 + (ys - 134.5) ** 2) / (360**2 + 270**2)
     dim = np.exp(rho2 * (falloff[0] + rho2 * (falloff[1] + rho2 * falloff[2])))
-    photo = np.repeat(np.round(180 * dim)[..., None], 3, axis=2).astype(np.uint8)
+    light = 180 / 76 * dim
+    photo = np.repeat((256 * light / (1 + light))[..., None], 3, axis=2).astype(np.uint8)
     frames, album = two_frames(photo, photo)
     frames = [replace(f, camera=camera) for f in frames]
     grid = middle(520, 240)
