@@ -162,17 +162,11 @@ def inside(outline: Array, points: Array) -> NDArray[np.bool_]:
     return np.asarray((side >= 0).all(1) | (side <= 0).all(1))
 
 
-def shows_all_of(tile: TileKey, outlines: Iterable[Array | None]) -> bool:
-    """Whether these outlines (4, 2), pixels of the tile's zoom, leave nothing of the tile uncovered."""
+def samples(tile: TileKey) -> Array:
+    """Points (81, 2) all over the tile and on its edges, pixels of its zoom."""
     steps = np.linspace(0, TILE_PX, 9)
     xs, ys = np.meshgrid(tile.x * TILE_PX + steps, tile.y * TILE_PX + steps)
-    points = np.column_stack((xs.ravel(), ys.ravel()))
-    for outline in outlines:
-        if outline is not None:
-            points = points[~inside(outline, points)]
-        if not len(points):
-            return True
-    return False
+    return np.column_stack((xs.ravel(), ys.ravel()))
 
 
 def moved_px(before: Array | None, after: Array | None) -> float:

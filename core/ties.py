@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.gallery import Gallery, apart
 from core.geometry import Array
 from core.matching import PairMatch
 from core.neighbours import NeighbourParams, Pair, Sighting, candidates, metres, peculiar
@@ -108,13 +109,14 @@ def ties_to_try(
     for i, j, points in edges:
         shared[i][j] = shared[j][i] = points
     seekers = np.flatnonzero(part != 0)
-    proposals = _alike(ordered, part, shared, _tried(tried, index), seekers, params)
+    words = peculiar(np.stack([f.words for f in ordered]))
+    proposals = _alike(ordered, words, part, shared, _tried(tried, index), seekers, params)
     return _chosen(ordered, proposals, part, params)
 
 
 def live_ties(
     seekers: Collection[str],
-    frames: Sequence[Sighting],
+    gallery: Gallery,
     homes: Mapping[str, Hashable],
     tried: Collection[Pair],
     params: TieParams | None = None,
@@ -122,16 +124,20 @@ def live_ties(
     """Pairs (low id, high id) of `seekers` with frames of other maps, worth matching besides those `tried`.
 
     While the mission grows: `homes` says which map each frame is part of, and each frame's thresholds are
-    the usual ones. Sorted; a function of the sets.
+    the usual ones. Only what lies near is looked at closely. Sorted.
     """
     params = params or LIVE
-    ordered, index = _indexed([f for f in frames if f.frame_id in homes])
-    label = {home: k for k, home in enumerate(sorted(set(homes.values()), key=str))}
-    part = np.array([label[homes[f.frame_id]] for f in ordered], np.int64)
-    rows = np.array(sorted(index[k] for k in seekers if k in index), np.int64)
-    if not len(rows) or part.min() == part.max():
+    seeking = {k for k in seekers if k in homes and k in gallery.row_of}
+    near = {k for k in gallery.within(seeking, params.reach_m) if k in homes}
+    label = {home: k for k, home in enumerate(sorted({homes[k] for k in near}, key=str))}
+    if len(label) < 2:
         return []
-    proposals = _alike(ordered, part, [{} for _ in ordered], _tried(tried, index), rows, params)
+    ordered, index = _indexed(gallery.sighting(k) for k in near)
+    part = np.array([label[homes[f.frame_id]] for f in ordered], np.int64)
+    rows = np.array(sorted(index[k] for k in seeking), np.int64)
+    words = apart(gallery.words(f.frame_id for f in ordered), gallery.average)
+    nobody: list[dict[int, int]] = [{} for _ in ordered]
+    proposals = _alike(ordered, words, part, nobody, _tried(tried, index), rows, params)
     return _chosen(ordered, proposals, part, params)
 
 
@@ -163,14 +169,14 @@ def _chosen(
 
 def _alike(
     frames: Sequence[Sighting],
+    words: NDArray[np.float32],
     part: NDArray[np.int64],
     shared: Sequence[Mapping[int, int]],
     done: Sequence[Sequence[int]],
     seekers: NDArray[np.int64],
     params: TieParams,
 ) -> Iterator[tuple[int, int, int, int]]:
-    """(rank, similarity, low, high): what each of the `seekers` proposes, best first."""
-    words = peculiar(np.stack([f.words for f in frames]))
+    """(rank, similarity, low, high): what each of the `seekers` proposes, best first. `words`: peculiar."""
     loud = 1 / np.sqrt(words.shape[1])
     above, below = (words > loud).astype(np.float32), (words < -loud).astype(np.float32)
     at = _positions(frames)

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from core import errors
-from core.coverage import mission_zoom, moved_px, outline_px, shows_all_of, tiles_under
-from core.geometry import Array, Pose, PosedFrame
+from core.coverage import mission_zoom, moved_px, outline_px, tiles_under
+from core.frame import FrameMeta
+from core.geometry import Pose, PosedFrame
 from core.grid import TileKey, ancestors
 from core.mosaic import MOST_TILES, Layout, waiting_frames
 from core.pose_graph import GraphFrame, Solution
@@ -20,6 +21,8 @@ from services.catalog.frames import Seen
 from services.catalog.pairs import Key as PairKey
 from services.catalog.poses import Placed, Poses, PoseUpdate
 from services.catalog.tiles import GROWN, HEAL, NEW, Key, TileBox
+from services.tables import Frame
+from workers.shown import Shown
 
 SHOWN_MOVE_PX = 0.5
 SHOWN_GAIN = 0.02
@@ -32,7 +35,7 @@ class Known:
     `solved_located`: frames with GPS in the last solve. `untried`: frames that have not looked for ties with
     other maps yet; `tries`: pairs that were asked for in order to tie maps and are still being matched.
     `tied`: maps were found to hang together since the last solve; `scale`: what that had for it.
-    `looked_at`, `with_fix`: what `located` goes by.
+    `looked_at`, `with_fix`: what `located` goes by; `shown`: what `grown` does.
     """
 
     generation: int
@@ -47,6 +50,7 @@ class Known:
     scale: Mapping[str, Any] | None = None
     looked_at: set[str] = field(default_factory=set)
     with_fix: set[str] = field(default_factory=set)
+    shown: Shown | None = None
 
     @classmethod
     def read(cls, poses: Poses, sightings: Iterable[Seen], rms_px: float | None) -> Known:
@@ -55,6 +59,20 @@ class Known:
         known = cls(poses.generation, _layout(poses), poses.solved_frames, rms_px or 0.0, seen)
         known.solved_located = len(known.located & poses.placed.keys())
         return known
+
+    def learn(self, new: Iterable[Frame]) -> None:
+        """Take in the rows of frames that were matched."""
+        fresh = (f for f in new if f.id not in self.seen)
+        self.seen |= {f.id: GraphFrame(f.id, f.name, FrameMeta.from_json(f.meta or {})) for f in fresh}
+
+    def grown(self, after: Layout, new_ids: set[str]) -> dict[Key, int]:
+        """The tiles that look different when the layout becomes that one, which has new frames besides."""
+        assert self.layout is not None
+        if new_ids & self.layout.frames.keys():
+            return changed(self.layout, after).dirty(0)
+        if self.shown is None or self.shown.layout is not self.layout:
+            self.shown = Shown(self.layout)
+        return self.shown.grow(after, new_ids)
 
     @property
     def solution(self) -> Solution | None:
@@ -171,23 +189,10 @@ def changed(before: Layout | None, after: Layout) -> Changes:
             for tile in before.under[frame_id] | after.under.get(frame_id, frozenset()):
                 off_px[tile] = max(off_px.get(tile, 0.0), off)
     news |= {TileKey(*tile) for tile in off_px} - shown
-    new_tiles: dict[Key, int] = {
-        tile: GROWN if tile in shown else NEW for tile in news - _full(news & shown, before)
-    }
+    there = Shown(before)
+    full = {tile for tile in news & shown if there.is_full(tile)}
+    new_tiles: dict[Key, int] = {tile: GROWN if tile in shown else NEW for tile in news - full}
     return Changes(new_tiles, {tile: off for tile, off in off_px.items() if tile not in new_tiles})
-
-
-def _full(tiles: set[TileKey], layout: Layout) -> set[TileKey]:
-    """Those of the tiles all of whose ground the layout's frames show already."""
-    assert layout.zoom is not None
-    outlines: dict[TileKey, list[Array | None]] = {tile: [] for tile in tiles}
-    for frame_id, under in sorted(layout.under.items()):
-        common = under & tiles
-        if common:
-            outline = outline_px(layout.frames[frame_id], layout.world, layout.zoom)
-            for tile in common:
-                outlines[tile].append(outline)
-    return {tile for tile in tiles if shows_all_of(tile, outlines[tile])}
 
 
 def _off_px(old: PosedFrame, new: PosedFrame | None, before: Layout, after: Layout) -> float:

@@ -20,7 +20,7 @@ from services.catalog.pairs import Key as PairKey
 from services.catalog.poses import PoseUpdate
 from services.catalog.tiles import Key as TileId
 from services.queue import send
-from services.tables import Mission
+from services.tables import Frame, Mission
 from workers import surveyed, tying, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
 from workers.dealing import AHEAD_TILES, runs
@@ -117,7 +117,7 @@ def _step(mission_id: str, epoch: int) -> bool:
     if mission.state == "finalising" and not desk.unread and (new or mission.final_generation is None):
         return _solve_finally(mission, epoch)
     if new and (mission.state != "finalising" or desk.unread >= WORTH_A_LOOK):
-        _pose(mission, epoch, {f.id for f in new})
+        _pose(mission, epoch, new)
         return True
     if mission.state == "open" and mission.mode == "visual" and _tie(mission, epoch, desk):
         return True
@@ -167,13 +167,6 @@ def _recall(mission: Mission) -> Known:
     return known
 
 
-def _learn(mission_id: str, known: Known, new_ids: set[str]) -> None:
-    if new_ids - known.seen.keys():
-        with db.read() as tx:
-            seen = frames.sightings(tx, mission_id)
-        known.seen |= {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in seen}
-
-
 def _tie(mission: Mission, epoch: int, desk: Backlog) -> bool:
     """Look for ties between maps; whether all was solved again because of some, or of another scale."""
     known = _known.get(mission.id)
@@ -183,7 +176,7 @@ def _tie(mission: Mission, epoch: int, desk: Backlog) -> bool:
     known.tied |= known.scale != mission.scale
     grown = len(known.homes) >= MERGE_GROWTH * known.solved_frames
     if known.tied and known.homes and (grown or desk == IDLE):
-        _pose(mission, epoch, set())
+        _pose(mission, epoch, [])
         return True
     if known.untried and desk.unread <= settings.workers:
         ask = tying.look(mission.id, known)
@@ -192,11 +185,11 @@ def _tie(mission: Mission, epoch: int, desk: Backlog) -> bool:
     return False
 
 
-def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
+def _pose(mission: Mission, epoch: int, new: Sequence[Frame]) -> None:
     """Place what is new; or, when the mission has grown enough or nothing is new, solve all of it again."""
     clock = Stopwatch()
-    known = _recall(mission)
-    _learn(mission.id, known, new_ids)
+    known, new_ids = _recall(mission), {f.id for f in new}
+    known.learn(new)
     before, solution = known.layout, known.solution
     matches = _matches(mission.id, new_ids)
     if solution is None or not new_ids or _due(known, new_ids, matches):
@@ -206,7 +199,7 @@ def _pose(mission: Mission, epoch: int, new_ids: set[str]) -> None:
         frames_here = [known.seen[k] for k in sorted(before.frames.keys() | new_ids)]
         found = place(solution, frames_here, new_ids, matches)
         after = joined(before, found, new_ids, known.camera_keys, mission.mode)
-        dirty = changed(before, after).dirty(0)
+        dirty = known.grown(after, new_ids)
         update = update_of(after, known.camera_keys, new_ids)
     with db.write() as tx:
         generation = poses.save(tx, mission.id, epoch, replace(update, dirty=dirty))

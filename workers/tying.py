@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
+
+from core.gallery import Gallery
 from core.neighbours import Sighting
 from core.pose_graph import GraphFrame
 from core.ties import live_ties
@@ -13,6 +16,9 @@ from workers.posing import Known
 
 LOOKING = 32
 """Frames that look for ties at a time."""
+_REMEMBERED = 8
+
+_galleries: OrderedDict[str, Gallery] = OrderedDict()
 
 
 def sighting(mission_id: str, frame: GraphFrame) -> Sighting:
@@ -31,10 +37,23 @@ def look(mission_id: str, known: Known) -> list[PairKey]:
     known.untried -= set(seekers)
     with db.read() as tx:
         tried = pairs.keys_of(tx, mission_id, seekers)
-    everyone = [sighting(mission_id, known.seen[k]) for k in sorted(homes) if k in known.seen]
-    found = live_ties(seekers, everyone, homes, tried)
+    gallery = _gallery(mission_id)
+    gallery.add(
+        sighting(mission_id, known.seen[k])
+        for k in sorted((homes.keys() & known.seen.keys()) - gallery.row_of.keys())
+    )
+    found = live_ties(seekers, gallery, homes, tried)
     known.tries |= set(found)
     return found
+
+
+def _gallery(mission_id: str) -> Gallery:
+    """What this process has seen of the mission's pictures."""
+    gallery = _galleries.pop(mission_id, None) or Gallery()
+    while len(_galleries) >= _REMEMBERED:
+        _galleries.popitem(last=False)
+    _galleries[mission_id] = gallery
+    return gallery
 
 
 def tied(mission_id: str, known: Known) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import sys
 from io import BytesIO
 from typing import Any
 
@@ -76,7 +75,7 @@ def test_a_photo_whose_ground_is_shown_is_on_the_map_as_soon_as_it_is_posed(
     sequence = bench.modules["sequence"]
     monkeypatch.setattr(sequence, "FEW", 2)  # few photos are solved all together otherwise
     # As in the middle of a large map, all of whose tiles there are full.
-    monkeypatch.setattr(sequence, "changed", lambda *_: sys.modules["workers.posing"].Changes({}, {}))
+    monkeypatch.setattr(sequence.Known, "grown", lambda *_: {})
     bench.upload([("again.jpg", photos[4][1] + b"\0")])
     while bench.frame_states()["again.jpg"] not in ("posed", "fused"):
         name, args = bench.queue.pop(0)
