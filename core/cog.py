@@ -1,48 +1,65 @@
-"""The mosaic as a cloud-optimised GeoTIFF, drawn by windows so that memory does not grow with the map."""
+"""The mosaic as a cloud-optimised GeoTIFF, drawn in pieces so that memory does not grow with the map.
+
+A piece is drawn once, halved down to the top of the pyramid there and then, and kept as a small file a level:
+whoever has the photos may draw any of them. GDAL puts them together.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import rasterio
 import rasterio.shutil
-from rasterio.enums import ColorInterp, Resampling
+from rasterio.enums import Resampling
 from rasterio.errors import CRSError
 from rasterio.vrt import WarpedVRT
-from rasterio.windows import Window
 
 from core.errors import BadCrs, NothingToMap
 from core.fusion import DEFAULT as FUSION_DEFAULT
 from core.fusion import FrameIndex, FusionParams, Photos, render
 from core.geometry import Array, PosedFrame, World
 from core.grid import UtmGrid, utm_epsg
+from core.inputs import LOOK, frame_digest
 from core.outline import ground_outline
+from core.pyramid import halve
+from core.virtual_raster import Patch, Virtual, write_virtual
 
 
 @dataclass(frozen=True, slots=True)
 class MosaicParams:
     """How the mosaic file is written.
 
-    `window_px`: side of what is drawn at once; `max_pixels`: a larger map is drawn coarser by powers of two;
-    `cache_mb`: GDAL's memory.
+    `piece_px`: side of what is kept in one file until all is drawn, a power of two; `window_px`: of what is
+    drawn at once; `max_pixels`: a larger map is drawn coarser by powers of two; `cache_mb`: GDAL's memory;
+    `threads` pack the file, whose bytes do not depend on how many they are.
     """
 
+    piece_px: int = 2048
     window_px: int = 1024
     block_px: int = 512
-    deflate_level: int = 6
+    deflate_level: int = 1
     max_pixels: int = 20_000_000_000
     cache_mb: int = 64
+    threads: int = 1
 
 
 DEFAULT = MosaicParams()
 
 
 LOCAL = "Not georeferenced: no photo has GPS. Place and north are assumed."
+
+SHOWS = b"shows"
+"""Content of the mark of a piece that is not empty."""
+
+Box = tuple[int, int, int, int]
+"""Column, row, width, height in the mosaic's pixels."""
 
 
 def flight_gsd_m(frames: Sequence[PosedFrame]) -> float:
@@ -51,6 +68,109 @@ def flight_gsd_m(frames: Sequence[PosedFrame]) -> float:
     if not gsds:
         raise NothingToMap
     return float(np.median(gsds))
+
+
+@dataclass(frozen=True, slots=True)
+class MosaicPlan:
+    """All that a mosaic is drawn from besides the photos, and the pieces that it falls into."""
+
+    world: World
+    grid: UtmGrid
+    index: FrameIndex
+    params: MosaicParams
+    fusion: FusionParams
+
+    @classmethod
+    def of(
+        cls,
+        world: World,
+        frames: Sequence[PosedFrame],
+        gsd_m: float | None = None,
+        params: MosaicParams = DEFAULT,
+        fusion: FusionParams = FUSION_DEFAULT,
+    ) -> MosaicPlan:
+        """`gsd_m`: metres per pixel, the flight's own by default. Raises NothingToMap."""
+        grid = mosaic_grid(world, frames, gsd_m or flight_gsd_m(frames), params.max_pixels)
+        shown = FrameIndex((f for f in frames if ground_outline(f) is not None), fusion)
+        return cls(world, grid, shown, params, fusion)
+
+    def digest(self) -> str:
+        """32 hex digits, the same for two plans whose pieces are."""
+        said = (LOOK, self.world, self.grid, self.params.piece_px, self.params.block_px, self.fusion)
+        digest = sha256(repr(said).encode())
+        for frame in self.index.frames:
+            digest.update(frame_digest(frame))
+        return digest.hexdigest()[:32]
+
+    def pieces(self) -> list[Box]:
+        """Row by row."""
+        return list(_cut((0, 0, self.grid.width, self.grid.height), self.params.piece_px))
+
+    @property
+    def levels(self) -> int:
+        """The full resolution and so many overviews that the last one is a single block."""
+        side, levels = max(self.grid.width, self.grid.height), 1
+        while side > self.params.block_px and 1 << levels <= self.params.piece_px:
+            side, levels = -(-side // 2), levels + 1
+        return levels
+
+    def draw(self, piece: Box, photos: Photos, folder: Path) -> None:
+        """Leave the piece in `folder`; one at a time may draw the same one there."""
+        rgba = np.zeros((self.params.piece_px, self.params.piece_px, 4), np.uint8)
+        for col, row, width, height in _cut(piece, self.params.window_px):
+            window = self.grid.window(col, row, width, height)
+            if near := self.index.overlapping(window, self.world):
+                shown = render(window, self.world, near, photos, self.fusion)
+                rgba[row - piece[1] :, col - piece[0] :][:height, :width] = shown
+        shows = bool(rgba[..., 3].any())
+        for level in range(self.levels if shows else 0):
+            rgba = halve(rgba) if level else rgba
+            box = _scaled(piece, level)
+            with rasterio.open(folder / _file(piece, level), "w", **self._profile(box)) as out:
+                out.write(rgba[: box[3], : box[2]].transpose(2, 0, 1))
+        (folder / _mark(piece)).write_bytes(SHOWS if shows else b"")
+
+    def is_drawn(self, piece: Box, folder: Path) -> bool:
+        """Whether all of the piece lies in `folder`."""
+        return (folder / _mark(piece)).exists()
+
+    def _profile(self, box: Box) -> dict[str, Any]:
+        kind = {"driver": "GTiff", "photometric": "RGB", "alpha": "YES"}
+        place = {"transform": rasterio.Affine.translation(*box[:2])}
+        size = {"width": box[2], "height": box[3], "count": 4, "dtype": "uint8"}
+        blocks = {"tiled": True, "blockxsize": self.params.block_px, "blockysize": self.params.block_px}
+        # Zstandard packs as well as deflate in half the time; GDAL alone will read it.
+        packing = {"compress": "zstd", "zstd_level": 1, "predictor": 2}
+        return kind | place | size | blocks | packing
+
+    def assemble(self, folder: Path, path: Path, crs: str | None = None) -> None:
+        """The COG at `path` of the pieces in `folder`: RGB + alpha, lossless, overviews, equal bytes always.
+
+        `crs`: what to warp it to, the UTM zone of the world's origin by default. The file appears whole or
+        not at all. Raises BadCrs.
+        """
+        target = checked_crs(crs)
+        with (
+            TemporaryDirectory(dir=path.parent, prefix=".mosaic-") as scratch,
+            rasterio.Env(GDAL_CACHEMAX=self.params.cache_mb * 1_000_000),
+        ):
+            whole = Path(scratch) / "whole.tif"
+            _pack(self._virtual(folder), whole, target, self.params)
+            os.replace(whole, path)
+
+    def _virtual(self, folder: Path) -> Path:
+        """The pieces in `folder` as one raster with overviews."""
+        local = any(f.pose.source == "vision-only" for f in self.index.frames)
+        tags = {"TIFFTAG_IMAGEDESCRIPTION": LOCAL, "GEOREFERENCED": "NO"} if local else {}
+        shown = [p for p in self.pieces() if (folder / _mark(p)).read_bytes() == SHOWS]
+        rasters = []
+        for level in range(self.levels):
+            gsd_m = self.grid.gsd_m * (1 << level)
+            to_crs = rasterio.Affine(gsd_m, 0, self.grid.left, 0, -gsd_m, self.grid.top)
+            size = _scaled((0, 0, self.grid.width, self.grid.height), level)[2:]
+            patches = [Patch(_file(p, level), *_scaled(p, level)) for p in shown]
+            rasters.append(Virtual(*size, to_crs, f"EPSG:{self.grid.epsg}", patches, tags))
+        return write_virtual(folder, rasters)
 
 
 def write_mosaic(
@@ -64,23 +184,20 @@ def write_mosaic(
     fusion: FusionParams = FUSION_DEFAULT,
     progress: Callable[[float], None] | None = None,
 ) -> None:
-    """Draw all frames into a COG at `path`: RGB + alpha, lossless, overviews, the same bytes every time.
+    """Draw all frames into a COG at `path`, in one process; see `MosaicPlan`.
 
-    `gsd_m`: metres per pixel, the flight's own by default. `crs`: what to warp the result to, the UTM zone of
-    the world's origin by default. `progress` is told the share done, 0 … 1. The file appears whole or not at
-    all. Raises NothingToMap, BadCrs.
+    `progress` is told the share drawn, 0 … 1. Raises NothingToMap, BadCrs.
     """
-    target = _checked(crs)
-    grid = mosaic_grid(world, frames, gsd_m or flight_gsd_m(frames), params.max_pixels)
+    checked_crs(crs)
+    plan = MosaicPlan.of(world, frames, gsd_m, params, fusion)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        TemporaryDirectory(dir=path.parent, prefix=".mosaic-") as scratch,
-        rasterio.Env(GDAL_CACHEMAX=params.cache_mb * 1_000_000, GDAL_TIFF_INTERNAL_MASK=True),
-    ):
-        drawn, whole = Path(scratch) / "drawn.tif", Path(scratch) / "whole.tif"
-        _draw(drawn, grid, world, frames, photos, params, fusion, progress or (lambda _: None))
-        _optimise(drawn, whole, target, params)
-        os.replace(whole, path)
+    pieces = plan.pieces()
+    with TemporaryDirectory(dir=path.parent, prefix=".pieces-") as folder:
+        for done, piece in enumerate(pieces, 1):
+            plan.draw(piece, photos, Path(folder))
+            if progress:
+                progress(done / len(pieces))
+        plan.assemble(Path(folder), path, crs)
 
 
 def mosaic_grid(world: World, frames: Sequence[PosedFrame], gsd_m: float, max_pixels: int) -> UtmGrid:
@@ -110,56 +227,30 @@ def _box(grid: UtmGrid, world: World, frame: PosedFrame) -> tuple[Array, Array] 
     return edges.min(0), edges.max(0)
 
 
-def _windows(grid: UtmGrid, side: int) -> Iterator[tuple[int, int, int, int]]:
-    for row in range(0, grid.height, side):
-        for col in range(0, grid.width, side):
-            yield col, row, min(side, grid.width - col), min(side, grid.height - row)
+def _cut(box: Box, side: int) -> Iterator[Box]:
+    """The box in squares of `side`, row by row, smaller at its right and its bottom."""
+    col0, row0, width, height = box
+    for row in range(0, height, side):
+        for col in range(0, width, side):
+            yield col0 + col, row0 + row, min(side, width - col), min(side, height - row)
 
 
-def _draw(
-    path: Path,
-    grid: UtmGrid,
-    world: World,
-    frames: Sequence[PosedFrame],
-    photos: Photos,
-    params: MosaicParams,
-    fusion: FusionParams,
-    progress: Callable[[float], None],
-) -> None:
-    index = FrameIndex((f for f in frames if ground_outline(f) is not None), fusion)
-    profile = {
-        "driver": "GTiff",
-        "width": grid.width,
-        "height": grid.height,
-        "count": 4,
-        "dtype": "uint8",
-        "crs": f"EPSG:{grid.epsg}",
-        "transform": rasterio.Affine(grid.gsd_m, 0, grid.left, 0, -grid.gsd_m, grid.top),
-        "photometric": "RGB",
-        "alpha": "YES",
-        "tiled": True,
-        "blockxsize": params.block_px,
-        "blockysize": params.block_px,
-        "compress": "deflate",
-        "zlevel": 1,
-        "sparse_ok": True,
-        "bigtiff": "YES",
-    }
-    windows = list(_windows(grid, params.window_px))
-    with rasterio.open(path, "w", **profile) as out:
-        if any(f.pose.source == "vision-only" for f in frames):
-            out.update_tags(TIFFTAG_IMAGEDESCRIPTION=LOCAL, GEOREFERENCED="NO")
-        out.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
-        for done, (col, row, width, height) in enumerate(windows, 1):
-            window = grid.window(col, row, width, height)
-            near = index.overlapping(window, world)
-            if near:
-                rgba = render(window, world, near, photos, fusion)
-                out.write(rgba.transpose(2, 0, 1), window=Window(col, row, width, height))
-            progress(done / len(windows))
+def _scaled(box: Box, level: int) -> Box:
+    """The same place in an overview."""
+    col, row, width, height = box
+    return col >> level, row >> level, -(-width // (1 << level)), -(-height // (1 << level))
 
 
-def _checked(crs: str | None) -> rasterio.CRS | None:
+def _mark(piece: Box) -> str:
+    return f"{piece[0]}-{piece[1]}.drawn"
+
+
+def _file(piece: Box, level: int) -> str:
+    return f"{piece[0]}-{piece[1]}.{level}.tif"
+
+
+def checked_crs(crs: str | None) -> rasterio.CRS | None:
+    """What GDAL makes of it. Raises BadCrs."""
     if crs is None:
         return None
     try:
@@ -171,8 +262,8 @@ def _checked(crs: str | None) -> rasterio.CRS | None:
         ) from error
 
 
-def _optimise(drawn: Path, whole: Path, crs: rasterio.CRS | None, params: MosaicParams) -> None:
-    """The drawn raster rearranged as a COG; one thread, because GDAL's order of blocks must not vary."""
+def _pack(drawn: Path, whole: Path, crs: rasterio.CRS | None, params: MosaicParams) -> None:
+    """The drawn raster rearranged as a COG; GDAL's threads keep the order of the blocks."""
     options = {
         "driver": "COG",
         "compress": "DEFLATE",
@@ -182,6 +273,7 @@ def _optimise(drawn: Path, whole: Path, crs: rasterio.CRS | None, params: Mosaic
         "overview_resampling": "AVERAGE",
         "bigtiff": "IF_SAFER",
         "sparse_ok": "YES",
+        "num_threads": str(params.threads),
     }
     with rasterio.open(drawn) as source:
         if crs is None or crs == source.crs:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from core.archives import TileSet, write_folder, write_mbtiles, write_pmtiles
-from core.cog import DEFAULT as MOSAIC
-from core.cog import mosaic_grid
+from core.cog import DEFAULT as COG
+from core.cog import MosaicPlan
 from core.coverage import mission_gsd_m
 from core.errors import NothingToMap, OrthostreamError
 from core.exports import (
@@ -22,7 +21,6 @@ from core.exports import (
     json_bytes,
     poses_document,
     route_csv,
-    write_mosaic,
 )
 from core.geometry import PosedFrame, World
 from core.grid import TileKey, utm_epsg
@@ -33,12 +31,14 @@ from core.superoverlay import write_kmz
 from services.catalog import exports, frames, missions, poses, surveys, tiles
 from services.catalog.frames import Seen
 from services.catalog.poses import Poses
-from services.export_names import crs_of
+from services.export_names import MOSAIC, crs_of
+from services.queue import send
 from services.report import report
 from services.tables import Export, Mission
 from workers import surveyed
 from workers.app import Stopwatch, db, log, settings, stage, store
 from workers.photos import MissionPhotos, shelf
+from workers.pieces import SLICE_S, SharedMosaic, locked
 
 MEDIA_TYPES = {
     ".tif": "image/tiff",
@@ -52,55 +52,59 @@ MEDIA_TYPES = {
     ".kmz": "application/vnd.google-earth.kmz",
 }
 
+FOLDER = settings.data_dir / "exports"
+"""Where files are while they are made."""
+
 Maker = Callable[[Path, Mission, Export], None]
 
 
 @stage("export")
 def export(mission_id: str, name: str) -> None:
-    """Wanted → ready or failed."""
-    with _alone(mission_id, name) as alone:
-        if not alone:
-            return  # a large mosaic takes longer than its wake-up is patient
+    """Wanted → ready or failed. Who finds somebody at it already lends a hand."""
+    with locked(FOLDER / f"{mission_id}-{name}.lock") as alone:
         with db.read() as tx:
             wanted = exports.get(tx, mission_id, name)
             mission = missions.get(tx, mission_id)
         if wanted is None or wanted.state != "wanted":
             return
         clock = Stopwatch()
-        try:
-            key, size = _made(mission, wanted)
-        except Exception as error:
-            if not isinstance(error, OrthostreamError):
-                log.exception("export failed", mission=mission_id, export=name)
-            with db.write() as tx:
-                exports.fail(tx, mission_id, name, wanted.revision, str(error) or type(error).__name__)
+        if alone:
+            _make(mission, wanted, clock)
             return
+    if _is_mosaic(name):
+        _help(mission, name, clock)
+
+
+def _make(mission: Mission, wanted: Export, clock: Stopwatch) -> None:
+    name = wanted.name
+    try:
+        key, size = _made(mission, wanted)
+    except Exception as error:
+        if not isinstance(error, OrthostreamError):
+            log.exception("export failed", mission=mission.id, export=name)
         with db.write() as tx:
-            media_type = MEDIA_TYPES[Path(name).suffix]
-            exports.finish(tx, mission_id, name, wanted.revision, key, size, media_type)
-            clock.spend(tx, mission_id, "export")
+            exports.fail(tx, mission.id, name, wanted.revision, str(error) or type(error).__name__)
+        return
+    with db.write() as tx:
+        exports.finish(tx, mission.id, name, wanted.revision, key, size, MEDIA_TYPES[Path(name).suffix])
+        clock.spend(tx, mission.id, "export")
 
 
-@contextmanager
-def _alone(mission_id: str, name: str) -> Iterator[bool]:
-    """Whether nobody else on this machine makes this file right now."""
-    folder = settings.data_dir / "exports"
-    folder.mkdir(exist_ok=True)
-    with (folder / f"{mission_id}-{name}.lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield False
-        else:
-            yield True
+def _help(mission: Mission, name: str, clock: Stopwatch) -> None:
+    """Draw some pieces of a mosaic that another worker makes, unless that one draws it from other poses."""
+    again = _shared(mission, name).lend_a_hand(SLICE_S)
+    with db.write() as tx:
+        clock.spend(tx, mission.id, "export")
+    if again:
+        send("export", mission.id, name)
 
 
 def _made(mission: Mission, wanted: Export) -> tuple[str, int]:
     """The file's key in the store, and its bytes."""
-    make = _mosaic if crs_of(wanted.name) else MAKERS.get(wanted.name)
+    make = _mosaic if _is_mosaic(wanted.name) else MAKERS.get(wanted.name)
     if make is None:
         raise OrthostreamError(f"{wanted.name} cannot be made by this version.")
-    with TemporaryDirectory(dir=settings.data_dir / "exports", prefix="making-") as folder:
+    with TemporaryDirectory(dir=FOLDER, prefix="making-") as folder:
         path = Path(folder) / wanted.name
         make(path, mission, wanted)
         key = f"missions/{mission.id}/exports/{wanted.revision}-{wanted.generation}/{wanted.name}"
@@ -126,12 +130,35 @@ def _placed(mission: Mission) -> tuple[World, list[NamedFrame]]:
     return known.world, named
 
 
+def _is_mosaic(name: str) -> bool:
+    return name == MOSAIC or crs_of(name) is not None
+
+
 def _mosaic(path: Path, mission: Mission, wanted: Export) -> None:
+    mosaic = _shared(mission, wanted.name)
+    mosaic.begin()
+    for _ in range(settings.workers - 1):
+        send("export", mission.id, wanted.name)
+    try:
+        mosaic.write(path, crs_of(wanted.name))
+    finally:
+        mosaic.forget()
+
+
+def _shared(mission: Mission, name: str) -> SharedMosaic:
+    """Raises NothingToMap."""
+    plan = _plan(mission)
+    photos = MissionPhotos(shelf, mission.id, mission.drawn_side)
+    pieces = FOLDER / f"{mission.id}-{name}.{plan.digest()}-{mission.drawn_side}"
+    return SharedMosaic(plan, photos, pieces, settings.workers)
+
+
+def _plan(mission: Mission) -> MosaicPlan:
+    """Raises NothingToMap."""
     world, named = _placed(mission)
     drawn: list[PosedFrame] = [n.posed for n in named]
-    gsd_m = mission_gsd_m(drawn, mission.drawn_side)
-    photos = MissionPhotos(shelf, mission.id, mission.drawn_side)
-    write_mosaic(path, world, drawn, photos, gsd_m, crs_of(wanted.name))
+    params = replace(COG, threads=settings.workers)
+    return MosaicPlan.of(world, drawn, mission_gsd_m(drawn, mission.drawn_side), params)
 
 
 def _poses(path: Path, mission: Mission, _wanted: Export) -> None:
@@ -174,11 +201,7 @@ def _report(path: Path, mission: Mission, _wanted: Export) -> None:
 
 def _stac(path: Path, mission: Mission, _wanted: Export) -> None:
     world, named = _placed(mission)
-    drawn: list[PosedFrame] = [n.posed for n in named]
-    gsd_m = mission_gsd_m(drawn, mission.drawn_side)
-    if gsd_m is None:
-        raise NothingToMap
-    grid = mosaic_grid(world, drawn, gsd_m, MOSAIC.max_pixels)
+    grid = _plan(mission).grid
     title = f"{mission.name} (not georeferenced)" if is_local(named) else mission.name
     item = stac_item(mission.id, title, world, named, grid, mission.created_at)
     path.write_bytes(json_bytes(item))

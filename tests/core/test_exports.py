@@ -37,6 +37,7 @@ from core.exports import (
 )
 from core.geometry import Array, Camera, Pose, PosedFrame, World
 from core.outline import ground_outline
+from core.pyramid import halve
 
 CAMERA = Camera(400, 300, 300.0, 199.5, 149.5, k1=-0.02, k2=0.004)
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -246,10 +247,27 @@ def test_the_mosaic_is_a_valid_cog_at_the_flights_gsd(mosaic: Path) -> None:
 def test_the_same_map_is_the_same_bytes_however_it_is_cut(mosaic: Path, tmp_path: Path) -> None:
     again = write(tmp_path / "again.tif", FLIGHT[::-1])
     assert again.read_bytes() == mosaic.read_bytes()
-    cut = write(tmp_path / "cut.tif", params=MosaicParams(window_px=512))
-    with rasterio.open(cut) as one, rasterio.open(mosaic) as other:
-        np.testing.assert_array_equal(one.read(), other.read())
+    cut = write(tmp_path / "cut.tif", params=MosaicParams(window_px=256, piece_px=512, threads=3))
+    assert cut.read_bytes() == mosaic.read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["again.tif", "cut.tif"]
+
+
+def test_every_overview_of_the_mosaic_is_the_level_below_it_halved(tmp_path: Path) -> None:
+    path = write(tmp_path / "m.tif", params=MosaicParams(piece_px=128, block_px=128))
+    with rasterio.open(path) as file:
+        factors = file.overviews(1)
+        finer = file.read()
+    assert factors == [2**k for k in range(1, len(factors) + 1)]
+    assert max(finer.shape) > 256
+    for level in range(len(factors)):
+        with rasterio.open(path, overview_level=level) as file:
+            shown = file.read()
+        height, width = shown.shape[1:]
+        whole = np.zeros((2 * height, 2 * width, 4), np.uint8)
+        whole[: finer.shape[1], : finer.shape[2]] = finer.transpose(1, 2, 0)
+        np.testing.assert_array_equal(shown.transpose(1, 2, 0), halve(whole))
+        finer = shown
+    assert max(finer.shape) <= 128
 
 
 def test_another_crs_shows_the_same_places(tmp_path: Path) -> None:
