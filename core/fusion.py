@@ -31,7 +31,7 @@ from core.geometry import Array, PosedFrame, World
 from core.grid import Grid
 from core.seams import REACH_CELLS, settle
 from core.sharpness import give_way
-from core.tone import curves, relit, show
+from core.tone import relit
 from core.warp import Int32, Lattice, Rgb, Views, knots, look, warp
 
 PAD_CELLS = 2
@@ -277,8 +277,8 @@ def _layer(
         needed[top:bottom, left:right],
         params.cell_px,
         params.sampling == "cubic",
+        frame.gain,
     )
-    show(warped, curves(frame.gain), warped)
     return Layer(label, int(top), int(left), gaussian_levels(warped, params.bands))
 
 

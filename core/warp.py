@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from core.compiled import compiled
 from core.geometry import Camera, PosedFrame, World
 from core.grid import Columns, Grid
-from core.tone import lit
+from core.tone import Gain, curves, lit, show
 
 Int16 = NDArray[np.int16]
 Int32 = NDArray[np.int32]
@@ -179,8 +179,10 @@ def knots(lattice: Lattice, frame: PosedFrame, camera: Camera, min_cos_view: flo
     return out
 
 
-def warp(photo: Rgb, lattice_knots: Int32, needed: NDArray[np.bool_], cell_px: int, cubic: bool) -> Rgb:
-    """A photo drawn onto the cells of a lattice.
+def warp(
+    photo: Rgb, lattice_knots: Int32, needed: NDArray[np.bool_], cell_px: int, cubic: bool, gain: Gain
+) -> Rgb:
+    """A photo, its light multiplied by `gain`, drawn onto the cells of a lattice.
 
     `lattice_knots`: (r + 2, c + 2, 2), with one knot around the (r, c) cells `needed`. Returns (r · cell_px,
     c · cell_px, 3) uint8; cells not needed may hold anything.
@@ -200,7 +202,8 @@ def warp(photo: Rgb, lattice_knots: Int32, needed: NDArray[np.bool_], cell_px: i
         around = np.ascontiguousarray(lattice_knots[top : bottom + 2, left : right + 2])
         _fine_maps(around, cell_px, xy, fraction)
         view = out[top * cell_px : bottom * cell_px, left * cell_px : right * cell_px]
-        view[:] = cv2.remap(photo, xy, fraction, method, borderMode=cv2.BORDER_REFLECT)
+        seen = cv2.remap(photo, xy, fraction, method, borderMode=cv2.BORDER_REFLECT)
+        show(np.asarray(seen, np.uint8), curves(gain), view)
     return out
 
 

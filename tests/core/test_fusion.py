@@ -1,6 +1,7 @@
 """Photos of a known ground, drawn back onto that ground."""
 
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -183,9 +184,9 @@ def test_what_was_not_warped_is_not_read(
     spoilt = []
 
     def junk(
-        photo: Rgb, places: NDArray[np.int32], needed: NDArray[np.bool_], cell_px: int, cubic: bool
+        photo: Rgb, places: NDArray[np.int32], needed: NDArray[np.bool_], cell_px: int, *rest: Any
     ) -> Rgb:
-        out = warp(photo, places, needed, cell_px, cubic)
+        out = warp(photo, places, needed, cell_px, *rest)
         idle = ~np.kron(needed, np.ones((cell_px, cell_px), bool))
         out[idle] = rng.integers(0, 256, (int(idle.sum()), 3))
         spoilt.append(int(idle.sum()))
