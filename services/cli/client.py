@@ -151,6 +151,11 @@ class Client:
         else:
             self._json("PUT", url, content=content.encode(), params={"use": list(use)})
 
+    def want(self, mission_id: str, name: str, crs: str | None = None) -> int:
+        """Has one export made, if it is not there yet; the answer's status."""
+        answer = self._ask("GET", _export_url(mission_id, name, crs), headers={"Range": "bytes=0-0"})
+        return 409 if answer.status_code == 409 else self._good(answer).status_code
+
     def download(
         self, mission_id: str, name: str, path: Path, wait: Callable[[], None], crs: str | None = None
     ) -> bool:
@@ -158,15 +163,12 @@ class Client:
 
         `crs`: of the mosaic, where not the mission's UTM zone.
         """
-        url = f"/missions/{mission_id}/exports/{name}" + (f"?crs={crs}" if crs else "")
-        while True:
-            answer = self._ask("GET", url, headers={"Range": "bytes=0-0"})
-            if answer.status_code == 409:
-                return False
-            if self._good(answer).status_code != 202:
-                break
+        while (status := self.want(mission_id, name, crs)) == 202:
             wait()
             time.sleep(0.25)
+        if status == 409:
+            return False
+        url = _export_url(mission_id, name, crs)
         part = path.with_name(path.name + ".part")
         self._good(self._stubbornly(lambda: self._stream(url, part)))
         part.replace(path)
@@ -219,6 +221,10 @@ class Client:
         if now > self._said_at + _SAY_EVERY_S:
             self._said_at = now
             self._say(f"{self.url}: {trouble.rstrip('.')}. Trying again for {give_up_at - now:.0f} s more …")
+
+
+def _export_url(mission_id: str, name: str, crs: str | None) -> str:
+    return f"/missions/{mission_id}/exports/{name}" + (f"?crs={crs}" if crs else "")
 
 
 def _problem(answer: httpx.Response) -> Mapping[str, Any]:

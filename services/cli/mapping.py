@@ -212,9 +212,11 @@ def fetch(client: Client, mission_id: str, out: Path, console: Console, crs: str
     out.mkdir(parents=True, exist_ok=True)
     with console.status("Writing the exports …") as status:
         fetched = []
+        of = {name: crs if name == MOSAIC else None for name in EXPORTS}
+        for name in EXPORTS:
+            client.want(mission_id, name, of[name])  # they are made side by side
         for name in EXPORTS:
             status.update(f"Writing {name} …")
-            of = crs if name == MOSAIC else None
-            if client.download(mission_id, name, out / name, lambda: None, of):
+            if client.download(mission_id, name, out / name, lambda: None, of[name]):
                 fetched.append(name)
         return fetched
