@@ -175,6 +175,9 @@ class Changes:
 def changed(before: Layout | None, after: Layout) -> Changes:
     """The native tiles that look different now. Where a photo shows no new ground, nothing does: what it
     shows better waits for the next pass over all tiles.
+
+    A photo that moved may see ground that none has seen: that is new, however little else may be healed. So
+    all that the photos of a layout see is shown, or is to be drawn next, at every time.
     """
     if before is None or before.zoom is None:
         return Changes(dict.fromkeys(after.cover, NEW), {})
@@ -188,10 +191,13 @@ def changed(before: Layout | None, after: Layout) -> Changes:
         elif old is not None and (off := _off_px(old, new, before, after)) > SHOWN_MOVE_PX:
             for tile in before.under[frame_id] | after.under.get(frame_id, frozenset()):
                 off_px[tile] = max(off_px.get(tile, 0.0), off)
-    news |= {TileKey(*tile) for tile in off_px} - shown
-    there = Shown(before)
-    full = {tile for tile in news & shown if there.is_full(tile)}
-    new_tiles: dict[Key, int] = {tile: GROWN if tile in shown else NEW for tile in news - full}
+    moved = {TileKey(*tile) for tile in off_px}
+    there, now = Shown(before), Shown(after)
+    grown = {tile for tile in news & shown if not there.is_full(tile)}
+    grown |= {tile for tile in moved & shown if now.sees_any(tile, there.unseen(tile))}
+    new_tiles: dict[Key, int] = {
+        tile: GROWN if tile in shown else NEW for tile in (news | moved) - shown | grown
+    }
     return Changes(new_tiles, {tile: off for tile, off in off_px.items() if tile not in new_tiles})
 
 

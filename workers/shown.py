@@ -32,15 +32,23 @@ class Shown:
 
     def is_full(self, tile: TileKey) -> bool:
         """Whether the frames leave nothing of the tile uncovered."""
+        return self.has(tile) and not len(self.unseen(tile))
+
+    def unseen(self, tile: TileKey) -> Array:
+        """Those of the tile's `samples` that no frame sees."""
         if not self.has(tile):
-            return False
+            return samples(tile)
         unseen = self._unseen[tile] if tile in self._unseen else samples(tile)
         for frame in self._to_look_at.pop(tile, ()):
             outline = self._outline(frame)
             if len(unseen) and outline is not None:
                 unseen = unseen[~inside(outline, unseen)]
         self._unseen[tile] = unseen
-        return not len(unseen)
+        return unseen
+
+    def sees_any(self, tile: TileKey, points: Array) -> bool:
+        """Whether a frame sees any of these of the tile's `samples`."""
+        return len(points) > 0 and not {(x, y) for x, y in points} <= {(x, y) for x, y in self.unseen(tile)}
 
     def grow(self, layout: Layout, new_ids: Collection[str]) -> dict[Key, int]:
         """Take in the frames `new_ids` of the layout; the tiles that look different now, with priorities.

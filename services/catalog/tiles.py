@@ -136,16 +136,19 @@ def claim_dirty(
 ) -> Sequence[DirtyTile]:
     """Tiles to render now, best priority first, 2 × 2 siblings together; they are the caller's for `ttl_s`.
 
-    At most `limit_tiles`, or one block of siblings when the limit is smaller than that. Of equal priority,
-    the longest waiting come first; `by_place`: neighbours, which share their photos, along strips four high.
+    At most `limit_tiles`, or one block of siblings when the limit is smaller than that. Of all that show new
+    ground, and of equal priority, the longest waiting come first; `by_place`: neighbours, which share their
+    photos, along strips four high.
     """
     hold(tx, mission_id)
     now = clock(now)
     free = _claimable(mission_id, ttl_s, now)
     block = _block()
     place = (func.min(DirtyTile.y.op(">>")(2)), func.min(DirtyTile.x.op(">>")(1)))
-    then = place if by_place else (func.min(DirtyTile.since),)
-    first = (func.min(DirtyTile.priority), *then, *block)
+    priority = func.min(DirtyTile.priority)
+    # While photos pour in there is new ground all the time: what is added elsewhere would wait for ever.
+    adds = case((priority < HEAL, NEW), else_=priority)
+    first = (priority, *place, *block) if by_place else (adds, func.min(DirtyTile.since), priority, *block)
     query = select(*block, func.count()).where(free).group_by(*block).order_by(*first).limit(limit_tiles)
     chosen: list[Key] = []
     total = 0

@@ -242,6 +242,23 @@ class TestDirtyTiles:
             assert tiles.claim_dirty(tx, mission_id, 100, 10.0, now=9.0) == []
             assert len(tiles.claim_dirty(tx, mission_id, 100, 10.0, now=10.0)) == 16  # the renderer died
 
+    def test_ground_to_be_added_does_not_wait_for_new_ground_that_came_later(
+        self, db: Database, mission_id: str
+    ) -> None:
+        grown, waited = (Z, 0, 0), 0
+        with db.write() as tx:
+            tiles.mark_dirty(tx, mission_id, {(Z, 98, 0): tiles.HEAL}, 1)
+            tiles.mark_dirty(tx, mission_id, {grown: tiles.GROWN, (Z, 2, 0): tiles.NEW}, 2)
+            for turn in range(3, 9):  # faster than tiles are drawn
+                tiles.mark_dirty(
+                    tx, mission_id, {(Z, 4 * turn, 0): tiles.NEW, (Z, 4 * turn, 2): tiles.NEW}, turn
+                )
+                (claimed,) = tiles.claim_dirty(tx, mission_id, 1, 100.0, now=0.0)
+                waited += 1
+                if (claimed.z, claimed.x, claimed.y) == grown:
+                    break
+        assert waited == 2
+
     def test_nobody_gets_a_tile_that_another_has(self, db: Database, mission_id: str, race: Race) -> None:
         with db.write() as tx:
             tiles.mark_dirty(
