@@ -85,8 +85,18 @@ def _waits(mission_id: str) -> bool:
         return False  # the last of them wakes us
     if mission.state == "finalising" and not desk.unread and _pairs_missing(mission_id):
         return False
+    if mission.state == "open" and not (desk.matched or desk.to_render or desk.to_publish):
+        return _may_tie(mission) or (desk == IDLE and _rests(mission))
     resting = desk.unread > settings.workers and time.monotonic() < _rested.get(mission_id, 0.0)
     return not resting
+
+
+def _may_tie(mission: Mission) -> bool:
+    """Whether ties are looked for, or found, that nobody has drawn a conclusion from yet."""
+    known = _known.get(mission.id)
+    return known is not None and bool(
+        known.untried or known.tries or known.tied or known.scale != mission.scale
+    )
 
 
 def _pairs_missing(mission_id: str) -> bool:

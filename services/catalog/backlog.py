@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from sqlalchemy import ColumnElement, func, or_, select, tuple_
+from sqlalchemy import ColumnElement, bindparam, func, or_, select, tuple_
 from sqlalchemy.orm import Session
 
-from services.catalog.rows import chunks, clock, mission
+from services.catalog.rows import chunks, clock, mission, table
 from services.catalog.tiles import HEAL, Key, Render, waiting
 from services.tables import DirtyTile, Frame, Tile
 
@@ -26,20 +26,29 @@ class Backlog:
     to_publish: int
 
 
+def _to_do() -> ColumnElement[bool]:
+    return or_(DirtyTile.rendered_generation.is_(None), DirtyTile.rendered_generation < DirtyTile.generation)
+
+
+_FRAME, _DIRTY = table(Frame).c, table(DirtyTile).c
+_FRAMES = (
+    select(_FRAME.state, func.count())
+    .where(_FRAME.mission_id == bindparam("mission"), _FRAME.state.in_(("received", "ready", "matched")))
+    .group_by(_FRAME.state)
+)
+_CLAIMED = _DIRTY.claimed_at > bindparam("begun")
+_TILES = select(
+    func.count().filter(_to_do(), _CLAIMED),
+    func.count().filter(_to_do(), or_(_DIRTY.claimed_at.is_(None), ~_CLAIMED)),
+    func.count().filter(_DIRTY.rendered_generation.is_not(None)),
+).where(_DIRTY.mission_id == bindparam("mission"))
+
+
 def of(tx: Session, mission_id: str, ttl_s: float, now: float | None = None) -> Backlog:
     """The mission's backlog. A claim older than `ttl_s` counts as not begun."""
-    by_state = select(Frame.state, func.count()).where(
-        Frame.mission_id == mission_id, Frame.state.in_(("received", "ready", "matched"))
-    )
-    frames = {row[0]: row[1] for row in tx.execute(by_state.group_by(Frame.state))}
-    to_do = _to_do()
-    claimed = DirtyTile.claimed_at > clock(now) - ttl_s
-    query = select(
-        func.count().filter(to_do, claimed),
-        func.count().filter(to_do, or_(DirtyTile.claimed_at.is_(None), ~claimed)),
-        func.count().filter(DirtyTile.rendered_generation.is_not(None)),
-    ).where(DirtyTile.mission_id == mission_id)
-    in_flight, to_render, to_publish = tx.execute(query).one()
+    frames = {row[0]: row[1] for row in tx.execute(_FRAMES, {"mission": mission_id})}
+    claims = {"mission": mission_id, "begun": clock(now) - ttl_s}
+    in_flight, to_render, to_publish = tx.execute(_TILES, claims).one()
     unread = frames.get("received", 0) + frames.get("ready", 0)
     return Backlog(unread, frames.get("matched", 0), in_flight, to_render, to_publish)
 
@@ -99,7 +108,3 @@ def _published(tx: Session, mission_id: str, keys: Sequence[Key]) -> Mapping[Key
             picture = (t.object_key, t.etag, t.media_type, t.size_bytes, t.inputs)
             found[t.z, t.x, t.y] = Render((t.z, t.x, t.y), t.generation, *picture)
     return found
-
-
-def _to_do() -> ColumnElement[bool]:
-    return or_(DirtyTile.rendered_generation.is_(None), DirtyTile.rendered_generation < DirtyTile.generation)
