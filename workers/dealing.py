@@ -1,12 +1,14 @@
-"""How the final pass is shared out: in runs of neighbouring tiles, long ones first, short ones at the end."""
+"""How work is shared out: in runs of what belongs together, long ones first, short ones at the end."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 
+from services.catalog.pairs import Key as PairKey
 from services.catalog.tiles import Key
 
-SHORTEST, LONGEST = 8, 48
+FEWEST_PAIRS, MOST_PAIRS = 6, 24
+SHORTEST, LONGEST = 4, 48
 AHEAD_TILES = 96
 """So many tiles a worker are handed out at most: enough that none waits for the next ones."""
 
@@ -20,12 +22,25 @@ def runs(tiles: Iterable[Key], to_render: int, workers: int) -> list[list[Key]]:
     found: list[list[Key]] = []
     run: list[Key] = []
     for tile in tiles:
-        size = min(max(-(-to_render // (2 * workers)), SHORTEST), LONGEST)
+        size = _size(to_render, workers, SHORTEST, LONGEST)
         if len(run) >= size and _block(run[-1]) != _block(tile):
             found.append(run)
             to_render, run = to_render - len(run), []
         run.append(tile)
     return [*found, run] if run else found
+
+
+def tasks(pairs: Sequence[PairKey], workers: int) -> Iterator[Sequence[PairKey]]:
+    """Pairs to match in their order, for one task after the other."""
+    start = 0
+    while start < len(pairs):
+        size = _size(len(pairs) - start, workers, FEWEST_PAIRS, MOST_PAIRS)
+        yield pairs[start : start + size]
+        start += size
+
+
+def _size(left: int, workers: int, least: int, most: int) -> int:
+    return min(max(-(-left // (2 * workers)), least), most)
 
 
 def _block(tile: Key) -> Key:

@@ -14,7 +14,7 @@ from services.catalog import backlog, frames, missions, pairs
 from services.catalog.frames import Seen
 from services.catalog.pairs import Key, PairResult
 from services.queue import send
-from workers.app import Stopwatch, db, stage
+from workers.app import Stopwatch, db, settings, stage
 from workers.photos import shelf
 
 LIVE = NeighbourParams(nearest=4, sectors=4, before_and_after=1, alike=2)
@@ -48,7 +48,7 @@ def match(mission_id: str, frame_id: str | None, wanted: Sequence[Key] = ()) -> 
         if frame_id is not None:
             frames.mark_matched(tx, mission_id, frame_id)
         clock.spend(tx, mission_id, "match")
-        news = frame_id is None or backlog.is_news(tx, mission_id, frame_id, CALM_S)
+        news = frame_id is None or backlog.is_news(tx, mission_id, frame_id, CALM_S, settings.workers)
     if news:
         send("sequence", mission_id)
 

@@ -14,6 +14,7 @@ from core.coverage import mission_zoom, moved_px, outline_px, tiles_under
 from core.frame import FrameMeta
 from core.geometry import Pose, PosedFrame
 from core.grid import TileKey, ancestors
+from core.matching import PairMatch
 from core.mosaic import MOST_TILES, Layout, waiting_frames
 from core.pose_graph import GraphFrame, Solution
 from core.pose_graph.survey import usable_fix
@@ -211,6 +212,16 @@ def _off_px(old: PosedFrame, new: PosedFrame | None, before: Layout, after: Layo
     move = moved_px(outline_px(old, before.world, after.zoom), outline_px(new, after.world, after.zoom))
     gain = float(np.abs(np.subtract(old.gain, new.gain)).max())
     return max(move, gain / SHOWN_GAIN * SHOWN_MOVE_PX)
+
+
+def lifts(known: Known, new_ids: set[str], matches: Iterable[PairMatch]) -> bool:
+    """Whether new frames tie what has no place to a frame that GPS alone has placed so far."""
+    stuck = (known.waiting.keys() | new_ids) - known.located
+    if not stuck:
+        return False
+    fixed = (new_ids | {k for k, home in known.homes.items() if home == k}) & known.located
+    ends = [(m.low, m.high) for m in matches if m.accepted and new_ids & {m.low, m.high}]
+    return any((a in stuck and b in fixed) or (b in stuck and a in fixed) for a, b in ends)
 
 
 def everything(layout: Layout, published: Iterable[Key]) -> dict[Key, int]:

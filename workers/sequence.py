@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from core.coverage import pass_pixels
 from core.grid import TILE_PX
 from core.matching import PairMatch
 from core.mosaic import Layout, lay_out, solved
-from core.pose_graph import GraphFrame, Solution, place
+from core.pose_graph import GraphFrame, place
 from core.scale import KnownScale
-from core.submaps import SubmapGraph, joins
-from core.ties import Canonical, canonical
-from services.catalog import backlog, frames, missions, pairs, poses, sharpening, surveys, tiles
+from core.submaps import joins
+from services.catalog import backlog, frames, missions, poses, sharpening, surveys, tiles
 from services.catalog.backlog import Backlog
 from services.catalog.pairs import Key as PairKey
 from services.catalog.poses import PoseUpdate
 from services.catalog.tiles import Key as TileId
 from services.queue import send
 from services.tables import Frame, Mission
-from workers import surveyed, tying, warmup
+from workers import solving, surveyed, tying, wanted, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
-from workers.dealing import AHEAD_TILES, runs
+from workers.dealing import AHEAD_TILES, runs, tasks
 from workers.lease import held
-from workers.photos import Pixels, shelf
-from workers.posing import Known, changed, everything, joined, sharper, update_of
-from workers.tying import sighting
+from workers.posing import Known, changed, everything, joined, lifts, sharper, update_of
 
 GROWTH = 2.0
 """All poses are solved again when the mission, or its frames with GPS, grew so many times since the last."""
@@ -38,8 +35,7 @@ SPARE = 6
 LIVE_SHARE = 0.85
 """What may be rendered before the final pass, as a share of that pass."""
 FEW = 8
-ASK_AGAIN_S = 10.0
-LIVE_TILES, PAIRS_PER_TASK = 12, 24
+LIVE_TILES = 12
 WORTH_A_LOOK = 24
 """While so many photos still wait to be read, a mission that is being finished grows live as well."""
 REST_S = 4.0
@@ -48,9 +44,6 @@ _REMEMBERED = 8
 IDLE = Backlog(0, 0, 0, 0, 0)
 
 _known: dict[str, Known] = {}
-_asked: dict[tuple[str, PairKey], float] = {}
-_expected: dict[str, tuple[int, float]] = {}
-"""How many pairs must be there before those that the final solve asked for can be; and how long it waits."""
 _come_back: dict[str, float] = {}
 _rested: dict[str, float] = {}
 
@@ -82,8 +75,10 @@ def _waits(mission_id: str) -> bool:
         mission = missions.get(tx, mission_id)
         desk = backlog.of(tx, mission_id, CLAIM_TTL_S)
     if mission.state == "finalising" and 0 < desk.unread < WORTH_A_LOOK:
+        if desk.unread <= settings.workers:  # fewer than there are workers for
+            _ask(mission_id, wanted.ahead(mission), SPARE)
         return False  # the last of them wakes us
-    if mission.state == "finalising" and not desk.unread and _pairs_missing(mission_id):
+    if mission.state == "finalising" and not desk.unread and wanted.missing(mission_id):
         return False
     if mission.state == "open" and not (desk.matched or desk.to_render or desk.to_publish):
         return _may_tie(mission) or (desk == IDLE and _rests(mission))
@@ -97,15 +92,6 @@ def _may_tie(mission: Mission) -> bool:
     return known is not None and bool(
         known.untried or known.tries or known.tied or known.scale != mission.scale
     )
-
-
-def _pairs_missing(mission_id: str) -> bool:
-    """Whether pairs that the final solve asked for cannot be there yet: every task of theirs wakes us."""
-    enough, until = _expected.get(mission_id, (0, 0.0))
-    if time.monotonic() > until:
-        return False
-    with db.read() as tx:
-        return pairs.computed(tx, mission_id) < enough
 
 
 def _come_back_later(mission_id: str) -> None:
@@ -189,10 +175,14 @@ def _tie(mission: Mission, epoch: int, desk: Backlog) -> bool:
         _pose(mission, epoch, [])
         return True
     if known.untried and desk.unread <= settings.workers:
-        ask = tying.look(mission.id, known)
-        for start in range(0, len(ask), PAIRS_PER_TASK):
-            send("match", mission.id, None, ask[start : start + PAIRS_PER_TASK])
+        _ask(mission.id, tying.look(mission.id, known))
     return False
+
+
+def _ask(mission_id: str, ask: Sequence[PairKey], priority: int | None = None) -> None:
+    """Have these pairs matched."""
+    for some in tasks(ask, settings.workers):
+        send("match", mission_id, None, some, priority=priority)
 
 
 def _pose(mission: Mission, epoch: int, new: Sequence[Frame]) -> None:
@@ -201,7 +191,7 @@ def _pose(mission: Mission, epoch: int, new: Sequence[Frame]) -> None:
     known, new_ids = _recall(mission), {f.id for f in new}
     known.learn(new)
     before, solution = known.layout, known.solution
-    matches = _matches(mission.id, new_ids)
+    matches = solving.matches(mission.id, new_ids)
     if solution is None or not new_ids or _due(known, new_ids, matches):
         after, dirty, update = _solved_again(mission, known)
     else:
@@ -230,28 +220,16 @@ def _due(known: Known, new_ids: set[str], matches: Sequence[PairMatch]) -> bool:
     if grown or (located > 0 and located >= GROWTH * known.solved_located):
         return True
     maps = {k: home for k, home in homes.items() if home != k or k in known.waiting}
-    known.tied |= joins(maps, new_ids, matches) or _lifts(known, homes, new_ids, matches)
+    known.tied |= joins(maps, new_ids, matches) or lifts(known, new_ids, matches)
     return known.tied and total >= MERGE_GROWTH * known.solved_frames
-
-
-def _lifts(
-    known: Known, homes: Mapping[str, int | str], new_ids: set[str], matches: Sequence[PairMatch]
-) -> bool:
-    """Whether new frames tie what has no place to a frame that GPS alone has placed so far."""
-    stuck = (known.waiting.keys() | new_ids) - known.located
-    if not stuck:
-        return False
-    fixed = (new_ids | {k for k, home in homes.items() if home == k}) & known.located
-    ends = [(m.low, m.high) for m in matches if m.accepted and new_ids & {m.low, m.high}]
-    return any((a in stuck and b in fixed) or (b in stuck and a in fixed) for a, b in ends)
 
 
 def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, int], PoseUpdate]:
     """All that were ever read: what came since may tie in a frame that had no place before."""
     before = known.layout
-    found, graph = _solve_all(mission, known)
+    found, graph = solving.again(mission, known)
     zoom_now = before.zoom if before is not None else None
-    thumb = _thumb(mission.id)
+    thumb = solving.thumbs(mission.id)
     after = lay_out(found, known.camera_keys, thumb, mission.drawn_side, zoom_now, mission.mode)
     if before is not None and before.zoom is not None and before.zoom != after.zoom:
         dirty = everything(after, _published(mission.id))
@@ -288,23 +266,6 @@ def _rests(mission: Mission) -> bool:
         return frames.quiet_s(tx, mission.id) >= settings.stalled_after_s
 
 
-def _solve_all(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:
-    matches = _matches(mission.id, None) if mission.mode == "visual" else []
-    matches = [m for m in matches if {m.low, m.high} <= known.seen.keys()]  # one's photo may be lost
-    scale = KnownScale.from_json(mission.scale)
-    seen, points = [known.seen[k] for k in sorted(known.seen)], surveyed.points_of(mission.id)
-    return solved(seen, Canonical((), (), tuple(matches)), scale, points)
-
-
-def _matches(mission_id: str, touching: set[str] | None) -> list[PairMatch]:
-    with db.read() as tx:
-        return [PairMatch.from_bytes(m) for m in pairs.accepted(tx, mission_id, touching)]
-
-
-def _thumb(mission_id: str) -> Callable[[str], Pixels]:
-    return lambda frame_id: shelf.thumb_of(mission_id, frame_id)
-
-
 def _published(mission_id: str) -> Sequence[TileId]:
     with db.read() as tx:
         return tiles.keys(tx, mission_id)
@@ -320,13 +281,14 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
             missions.finish(tx, mission.id, epoch)
         return False
     graph = {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in seen}
-    pairs_of_all = _canonical_pairs(mission, list(graph.values()))
+    pairs_of_all, ask = wanted.canonical_pairs(mission, list(graph.values()))
+    _ask(mission.id, ask)
     if pairs_of_all is None:
         return False
     points = surveyed.points_of(mission.id)
     found, submaps = solved(list(graph.values()), pairs_of_all, KnownScale.from_json(mission.scale), points)
     keys = {k: f.meta.camera_key for k, f in graph.items()}
-    layout = lay_out(found, keys, _thumb(mission.id), mission.drawn_side, mode=mission.mode)
+    layout = lay_out(found, keys, solving.thumbs(mission.id), mission.drawn_side, mode=mission.mode)
     update = replace(
         update_of(layout, keys),
         dirty=everything(layout, _published(mission.id)),
@@ -346,40 +308,9 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
     known = Known(generation, layout, len(graph), found.reprojection_rms_px, graph)
     known.solved_located, known.scale = len(known.located), mission.scale
     _known[mission.id] = known
-    _expected.pop(mission.id, None)
+    wanted.forget(mission.id)
     log.info("solved finally", mission=mission.id, frames=len(graph), posed=len(layout.frames))
     return True
-
-
-def _canonical_pairs(mission: Mission, graph: Sequence[GraphFrame]) -> Canonical | None:
-    """None while some are not matched yet."""
-    if mission.mode != "visual":
-        return Canonical((), (), ())
-    sightings = [sighting(mission.id, f) for f in graph]
-    return canonical(sightings, lambda wanted: _matched(mission.id, set(wanted)))
-
-
-def _matched(mission_id: str, wanted: set[PairKey]) -> list[PairMatch] | None:
-    """The accepted ones of these pairs, once all are computed."""
-    if not _all_matched(mission_id, wanted):
-        return None
-    return [m for m in _matches(mission_id, None) if (m.low, m.high) in wanted]
-
-
-def _all_matched(mission_id: str, wanted: set[PairKey]) -> bool:
-    """Whether all these pairs are computed; asks for those that are not."""
-    with db.read() as tx:
-        done = set(pairs.keys(tx, mission_id, "done"))
-    missing, now = sorted(wanted - done), time.monotonic()
-    _expected[mission_id] = (len(done) + len(missing), now + ASK_AGAIN_S)
-    ask = [p for p in missing if _asked.get((mission_id, p), 0.0) < now]
-    for start in range(0, len(ask), PAIRS_PER_TASK):
-        send("match", mission_id, None, ask[start : start + PAIRS_PER_TASK])
-    _asked.update({(mission_id, p): now + ASK_AGAIN_S for p in ask})
-    if not missing:
-        for pair in wanted:
-            _asked.pop((mission_id, pair), None)
-    return not missing
 
 
 def _dispatch(mission: Mission, desk: Backlog) -> bool:

@@ -53,10 +53,11 @@ def of(tx: Session, mission_id: str, ttl_s: float, now: float | None = None) -> 
     return Backlog(unread, frames.get("matched", 0), in_flight, to_render, to_publish)
 
 
-def is_news(tx: Session, mission_id: str, frame_id: str, calm_s: float) -> bool:
+def is_news(tx: Session, mission_id: str, frame_id: str, calm_s: float, workers: int = 0) -> bool:
     """Whether to wake the sequencer for this frame, which was matched just now.
 
-    Not for one of many: the first of every `calm_s` wakes it, and the last that there is to match.
+    Not for one of many: the first of every `calm_s` wakes it, the last that there is to match, and the one
+    after which there are only as many as `workers` are at.
     """
     at = tx.scalar(select(Frame.matched_at).where(Frame.mission_id == mission_id, Frame.id == frame_id))
     since = (at or 0.0) // calm_s * calm_s
@@ -64,7 +65,7 @@ def is_news(tx: Session, mission_id: str, frame_id: str, calm_s: float) -> bool:
     unread = Frame.state.in_(("received", "ready"))
     query = select(func.count().filter(waiting), func.count().filter(unread))
     others, still_to_come = tx.execute(query.where(Frame.mission_id == mission_id)).one()
-    return not others or not still_to_come
+    return not others or still_to_come in (0, workers)
 
 
 @dataclass(frozen=True, slots=True)

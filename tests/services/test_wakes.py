@@ -21,11 +21,11 @@ def arrive(db: Database, mission_id: str, names: str) -> None:
             frames.mark_ready(tx, mission_id, name, META, 1.0)
 
 
-def match(db: Database, mission_id: str, name: str, at: float) -> bool:
+def match(db: Database, mission_id: str, name: str, at: float, workers: int = 0) -> bool:
     """Whether the sequencer is woken."""
     with db.write() as tx:
         frames.mark_matched(tx, mission_id, name, at)
-        return backlog.is_news(tx, mission_id, name, CALM_S)
+        return backlog.is_news(tx, mission_id, name, CALM_S, workers)
 
 
 def test_of_many_frames_matched_at_once_the_first_wakes_and_the_last(db: Database, mission_id: str) -> None:
@@ -33,6 +33,12 @@ def test_of_many_frames_matched_at_once_the_first_wakes_and_the_last(db: Databas
     woken = [match(db, mission_id, name, 10.0 + 0.1 * k) for k, name in enumerate("abcd")]
     assert woken == [True, False, False, False]
     assert match(db, mission_id, "e", 10.49)  # nobody comes after it who could wake for it
+
+
+def test_the_frame_after_which_some_workers_have_nothing_to_read_wakes(db: Database, mission_id: str) -> None:
+    arrive(db, mission_id, "abcdefg")
+    woken = [match(db, mission_id, name, 10.0 + 0.05 * k, workers=2) for k, name in enumerate("abcdefg")]
+    assert woken == [True, False, False, False, True, False, True]
 
 
 def test_a_wake_up_that_was_lost_is_made_up_for_within_moments(db: Database, mission_id: str) -> None:

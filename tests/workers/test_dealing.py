@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workers.dealing import LONGEST, SHORTEST, runs
+from workers.dealing import FEWEST_PAIRS, LONGEST, MOST_PAIRS, SHORTEST, runs, tasks
 
 KEYS = st.sets(st.tuples(st.just(20), st.integers(0, 40), st.integers(0, 12)), max_size=300)
 
@@ -37,3 +37,14 @@ def test_no_worker_waits_longer_than_for_a_short_run(keys: set[tuple[int, int, i
     for run in found:
         heapq.heapreplace(busy, busy[0] + len(run))
     assert max(busy) - min(busy) <= max(2 * SHORTEST, len(keys) / workers / 10 + SHORTEST + 3)
+
+
+@given(st.integers(0, 900), st.integers(1, 8))
+def test_every_pair_is_in_one_task_and_the_last_tasks_are_short(count: int, workers: int) -> None:
+    pairs = [("a", f"{k:03d}") for k in range(count)]
+    found = list(tasks(pairs, workers))
+    assert [pair for some in found for pair in some] == pairs
+    sizes = [len(some) for some in found]
+    assert sizes == sorted(sizes, reverse=True)
+    assert all(FEWEST_PAIRS <= size <= MOST_PAIRS for size in sizes[:-1])
+    assert not sizes or sizes[-1] <= max(FEWEST_PAIRS, count / 2 / workers + 1)

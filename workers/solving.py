@@ -1,0 +1,49 @@
+"""What all poses of a mission are solved from: its photos, their matches, and how bright they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+
+from core.matching import PairMatch
+from core.mosaic import solved
+from core.pose_graph import Solution
+from core.scale import KnownScale
+from core.submaps import SubmapGraph
+from core.ties import Canonical
+from services.catalog import pairs
+from services.tables import Mission
+from workers import surveyed
+from workers.app import db, settings
+from workers.photos import BytesLru, Pixels, shelf
+from workers.posing import Known
+
+_thumbs = BytesLru(settings.photo_cache_bytes // 2)
+"""A sequencer draws no tiles: what others hold photos with holds the thumbnails of every solve."""
+
+
+def matches(mission_id: str, touching: Collection[str] | None) -> list[PairMatch]:
+    """The accepted matches, of all pairs or of those of some frames, by (low, high)."""
+    with db.read() as tx:
+        return [PairMatch.from_bytes(m) for m in pairs.accepted(tx, mission_id, touching)]
+
+
+def thumbs(mission_id: str) -> Callable[[str], Pixels]:
+    """A frame's thumbnail by its id. That raises ObjectNotFound."""
+
+    def thumb(frame_id: str) -> Pixels:
+        def load() -> tuple[Pixels, int]:
+            found = shelf.features_of(mission_id, frame_id).thumb.copy()
+            return found, found.nbytes
+
+        found: Pixels = _thumbs.get((mission_id, frame_id), load)
+        return found
+
+    return thumb
+
+
+def again(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:
+    """All poses, from what is matched by now."""
+    accepted = matches(mission.id, None) if mission.mode == "visual" else []
+    accepted = [m for m in accepted if {m.low, m.high} <= known.seen.keys()]  # one's photo may be lost
+    seen, points = [known.seen[k] for k in sorted(known.seen)], surveyed.points_of(mission.id)
+    return solved(seen, Canonical((), (), tuple(accepted)), KnownScale.from_json(mission.scale), points)
