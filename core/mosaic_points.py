@@ -15,7 +15,7 @@ from core.checkpoints import Checkpoints, Observation, rms_levels
 from core.geometry import Array, World
 from core.grid import UtmGrid
 
-Gray = NDArray[np.float32]
+Floats = NDArray[np.float32]
 Outcome = Literal["found", "outside", "flat", "poor", "ambiguous"]
 Picture = Callable[[UtmGrid], NDArray[np.uint8]]
 """What the mosaic shows in a window of its grid: RGBA (height, width, 4) uint8."""
@@ -27,14 +27,17 @@ PhotoOf = Callable[[str], NDArray[np.uint8]]
 class SearchParams:
     """How a marked point is looked for.
 
-    `radius_m`: around where its own photo's pose puts it, `max_radius_px` at most; `half_px`: of the patch,
-    in pixels of the mosaic. Not found are patches that correlate less than `min_score`, that have another
-    peak less than `margin` below the best, or less contrast than `min_contrast` grey levels.
+    `radius_m`: around where its own photo's pose puts it, `max_radius_px` at most. `halves_px`: of the
+    patches, in pixels of the mosaic. A large one tells places apart; but what stands up in it looks otherwise
+    from elsewhere: where one correlates less than `clear` a smaller one is tried, and the better one counts.
+    Not found are patches that correlate less than `min_score`, that have another peak less than `margin`
+    below the best, or less contrast than `min_contrast` grey levels.
     """
 
     radius_m: float = 4.0
     max_radius_px: int = 200
-    half_px: int = 20
+    halves_px: tuple[int, ...] = (20, 12)
+    clear: float = 0.85
     min_score: float = 0.6
     margin: float = 0.05
     min_contrast: float = 2.0
@@ -119,7 +122,7 @@ def _pixel(o: Observation, world: World, grid: UtmGrid) -> Array:
 
 def _around(places: Sequence[Array], grid: UtmGrid, picture: Picture, p: SearchParams) -> Picture:
     """The picture, drawn but once where the windows of one point's photos overlap: pixels are absolute."""
-    side = p.reach_px(grid) + p.half_px
+    side = p.reach_px(grid) + max(p.halves_px)
     low = np.rint(np.min(places, axis=0)).astype(int) - side
     size = np.rint(np.max(places, axis=0)).astype(int) + side + 1 - low
     if (size > 4 * side).any():
@@ -142,14 +145,36 @@ def _look_up(
     photo: NDArray[np.uint8],
     p: SearchParams,
 ) -> Lookup:
+    best: Lookup | None = None
+    for half in p.halves_px:
+        found = _look_for(o, at, half, world, grid, picture, photo, p)
+        if best is None or (found.outcome == "found", found.score) > (best.outcome == "found", best.score):
+            best = found
+        if best.outcome == "found" and best.score >= p.clear:
+            break
+    assert best is not None
+    return best
+
+
+def _look_for(
+    o: Observation,
+    at: Array,
+    half: int,
+    world: World,
+    grid: UtmGrid,
+    picture: Picture,
+    photo: NDArray[np.uint8],
+    p: SearchParams,
+) -> Lookup:
+    """The pixel looked up by a patch of one size."""
     name, reach = o.sighting.point, p.reach_px(grid)
     middle = np.rint(at).astype(int)
-    patch, inside = _patch(o, world, grid, photo, middle, p.half_px)
-    if inside[p.half_px, p.half_px] == 0 or inside.mean() < 0.5:
+    patch, inside = _patch(o, world, grid, photo, middle, half)
+    if inside[half, half] == 0 or inside.mean() < 0.5:
         return Lookup(name, "outside")
-    if float(patch[inside > 0].std()) < p.min_contrast:
+    if float(patch[inside > 0].std(axis=0).max()) < p.min_contrast:
         return Lookup(name, "flat")
-    side = reach + p.half_px
+    side = reach + half
     window = picture(grid.window(int(middle[0]) - side, int(middle[1]) - side, 2 * side + 1, 2 * side + 1))
     scores = _scores(window, patch, inside)
     if scores is None:
@@ -157,7 +182,7 @@ def _look_up(
     best, place = _peak(scores)
     if best < p.min_score or place is None:
         return Lookup(name, "poor", best)
-    if _runner_up(scores, p.half_px // 2) > best - p.margin:
+    if _runner_up(scores, half // 2) > best - p.margin:
         return Lookup(name, "ambiguous", best)
     col, row = at + place - reach
     crs_xy = np.array([grid.left + (col + 0.5) * grid.gsd_m, grid.top - (row + 0.5) * grid.gsd_m])
@@ -166,8 +191,8 @@ def _look_up(
 
 def _patch(
     o: Observation, world: World, grid: UtmGrid, photo: NDArray[np.uint8], middle: NDArray[np.int_], half: int
-) -> tuple[Gray, Gray]:
-    """The photo around the pixel as the mosaic would draw it, grey, and 1 where the photo reaches."""
+) -> tuple[Floats, Floats]:
+    """The photo around the pixel as the mosaic would draw it, (n, n, 3), and 1 where the photo reaches."""
     cols, rows = np.meshgrid(*(m + np.arange(-half, half + 1) for m in middle))
     pose, camera = o.frame.pose, o.frame.camera.scaled(photo.shape[1], photo.shape[0])
     xy = grid.to_world(world, cols.ravel(), rows.ravel(), pose.ground_h_m)
@@ -175,31 +200,31 @@ def _patch(
     low, high = np.floor(uv.min(0)).astype(int) - 2, np.ceil(uv.max(0)).astype(int) + 3
     low, high = np.clip(low, 0, None), np.clip(high, 1, (camera.width, camera.height))
     if (high - low < 2).any():
-        return np.zeros(cols.shape, np.float32), np.zeros(cols.shape, np.float32)
-    cut = cv2.cvtColor(np.ascontiguousarray(photo[low[1] : high[1], low[0] : high[0]]), cv2.COLOR_RGB2GRAY)
+        return np.zeros((*cols.shape, 3), np.float32), np.zeros(cols.shape, np.float32)
+    cut = np.ascontiguousarray(photo[low[1] : high[1], low[0] : high[0]])
     u, v = (uv - low).astype(np.float32).T.reshape(2, *cols.shape)
-    grey = cv2.remap(
+    seen = cv2.remap(
         cut.astype(np.float32), u, v, cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
     edge = np.array([camera.width - 1, camera.height - 1])
     inside = ((uv >= 0) & (uv <= edge)).all(1).reshape(cols.shape)
-    return np.asarray(grey, np.float32), inside.astype(np.float32)
+    return np.asarray(seen, np.float32), inside.astype(np.float32)
 
 
-def _scores(window: NDArray[np.uint8], patch: Gray, inside: Gray) -> Gray | None:
-    """Correlation (2 reach + 1)², −1 where the mosaic ends under the patch; None where it does everywhere."""
+def _scores(window: NDArray[np.uint8], patch: Floats, inside: Floats) -> Floats | None:
+    """Correlation in colour (2 reach + 1)², −1 where the mosaic ends under the patch; None if everywhere."""
     shown = (window[:, :, 3] == 255).astype(np.float32)
-    grey = cv2.cvtColor(np.ascontiguousarray(window[:, :, :3]), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    colours = np.ascontiguousarray(window[:, :, :3], np.float32)
     covered = cv2.matchTemplate(shown, inside, cv2.TM_CCORR) >= 0.95 * inside.sum()
     if not covered.any():
         return None
     mask = None if inside.all() else inside
-    scores = cv2.matchTemplate(grey, patch, cv2.TM_CCOEFF_NORMED, mask=mask)
+    scores = cv2.matchTemplate(colours, patch, cv2.TM_CCOEFF_NORMED, mask=mask)
     return np.where(covered & np.isfinite(scores), scores, np.float32(-1)).astype(np.float32)
 
 
-def _peak(scores: Gray) -> tuple[float, Array | None]:
+def _peak(scores: Floats) -> tuple[float, Array | None]:
     """The best correlation and its place (column, row) by parabolas; None at the border of the search."""
     row, col = (int(v) for v in np.unravel_index(int(scores.argmax()), scores.shape))
     best = float(scores[row, col])
@@ -215,7 +240,7 @@ def _vertex(before: float, here: float, after: float) -> float:
     return 0.0 if bend >= 0 else min(max(0.5 * (before - after) / bend, -0.5), 0.5)
 
 
-def _runner_up(scores: Gray, apart_px: int) -> float:
+def _runner_up(scores: Floats, apart_px: int) -> float:
     """The highest local peak at least so far from the best one."""
     peaks = np.where(scores >= cv2.dilate(scores, np.ones((3, 3), np.uint8)), scores, np.float32(-1))
     row, col = (int(v) for v in np.unravel_index(int(scores.argmax()), scores.shape))

@@ -221,6 +221,50 @@ def test_rows_that_look_alike_are_not_told_apart() -> None:
     assert "found" not in {k.outcome for k in looked}
 
 
+def one_grey(rgba: Pixels) -> Pixels:
+    """The same colours, all of them as bright."""
+    grey = rgba[..., :3].astype(float) @ (0.299, 0.587, 0.114)
+    rest = rgba[..., :3] - grey[..., None]
+    return np.dstack((np.clip(128 + rest, 0, 255), rgba[..., 3:])).astype(np.uint8)
+
+
+class Court(Land):
+    """A land whose colours alone tell its places apart."""
+
+    def photo(self, frame_id: str) -> Pixels:
+        return one_grey(super().photo(frame_id))
+
+
+def test_colours_tell_places_apart_that_are_equally_bright(found: list[Lookup]) -> None:
+    drawn = mosaic_of(FLIGHT)
+    looked = looked_up(survey(), lambda window: one_grey(drawn(window)), Court())
+    assert {k.outcome for k in looked} == {"found"}
+    for one, other in zip(looked, found, strict=True):
+        assert np.hypot(*(one.place - other.place)) < 0.5 * GRID.gsd_m
+
+
+def test_what_looks_otherwise_around_a_point_does_not_hide_it(found: list[Lookup]) -> None:
+    """A fence beside the point leans the other way in the photo that the mosaic was drawn from."""
+    points = survey(names={"b": POINTS["b"]})
+    cols, rows = GRID.from_world(WORLD, np.array([POINTS["b"]]), 0.0)
+    drawn = mosaic_of(FLIGHT)
+    noise = np.random.default_rng(2).integers(0, 255, (GRID.height, GRID.width, 3), np.uint8)
+
+    def fenced(window: UtmGrid) -> Pixels:
+        picture = drawn(window).copy()
+        y, x = np.mgrid[: window.height, : window.width]
+        y, x = y + window.row0, x + window.col0
+        away = np.maximum(abs(x - cols[0]), abs(y - rows[0])) > 14
+        picture[away, :3] = noise[y[away] % GRID.height, x[away] % GRID.width]
+        return picture
+
+    looked = looked_up(points, fenced)
+    expected = [k for k in found if k.point == "b"]
+    assert {k.outcome for k in looked} == {"found"}
+    for one, other in zip(looked, expected, strict=True):
+        assert np.hypot(*(one.place - other.place)) < 0.5 * GRID.gsd_m
+
+
 def test_the_report_names_every_point(found: list[Lookup]) -> None:
     names = POINTS | {"far": (5000.0, 0.0)}
     to_crs = Transformer.from_crs(4326, 32632, always_xy=True)
