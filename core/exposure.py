@@ -7,8 +7,9 @@ gains are held near 1, so that the map as a whole gets neither brighter nor dark
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,11 +17,15 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from core.compiled import compiled
 from core.geometry import Array, PosedFrame, World
 from core.tone import Gain, log_light
+from core.warp import intrinsics, project
 
 Thumb = NDArray[np.uint8]
 Index = NDArray[np.int64]
+Design = Any
+"""A matrix (M, unknowns), dense or sparse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +47,7 @@ class ExposureParams:
     doubt: float = 1.0
     gain_sigma: float = 0.5
     falloff_sigma: float = 0.3
-    iterations: int = 8
+    iterations: int = 6
 
 
 DEFAULT = ExposureParams()
@@ -50,12 +55,27 @@ DEFAULT = ExposureParams()
 
 @dataclass(frozen=True, slots=True)
 class _Sightings:
-    """Who saw which point in what colour. `frame`, `point`: (M,) int64; `log`: (M, 3); `rho2`: (M,)."""
+    """Who saw which point in what light. `frame`, `point`: (M,) int64, points ascending; `log`: (M, 3);
+    `rho2`: (M,); `start`: where the sightings of each point begin, (P,).
+    """
 
     frame: Index
     point: Index
     log: Array
     rho2: Array
+    start: Index
+
+    @property
+    def powers(self) -> Array:
+        """What a camera's falloff is multiplied with, (M, 3)."""
+        return np.column_stack((self.rho2, self.rho2**2, self.rho2**3))
+
+    def sums(self, values: Array) -> Array:
+        """The sums of (M, …) values over each point's sightings, (P, …)."""
+        return np.asarray(np.add.reduceat(values, self.start, axis=0))
+
+
+Solver = Callable[[Design, _Sightings, Array, Array], Array]
 
 
 def balance(
@@ -86,6 +106,25 @@ def balanced(
     ]
 
 
+def fitted(
+    new: Sequence[PosedFrame],
+    known: Sequence[PosedFrame],
+    thumbs: Mapping[str, Thumb],
+    params: ExposureParams = DEFAULT,
+) -> list[PosedFrame]:
+    """The new frames by ascending id, with gains that suit the known ones, which keep theirs.
+
+    `thumbs`: as for `balance`, of all of them. Every camera keeps its falloff.
+    """
+    ids = {f.frame_id for f in new}
+    frames = sorted([*new, *(f for f in known if f.frame_id not in ids)], key=lambda f: f.frame_id)
+    seen = _sightings(frames, thumbs, params)
+    free = np.array([f.frame_id in ids for f in frames], bool)
+    gains = _fit(seen, frames, free, params) if len(seen.frame) else np.ones((int(free.sum()), 3))
+    lit = zip([f for f in frames if f.frame_id in ids], gains.tolist(), strict=True)
+    return [replace(f, gain=(g[0], g[1], g[2])) for f, g in lit]
+
+
 def replace_light(frame: PosedFrame, gain: Gain, falloff: tuple[float, ...]) -> PosedFrame:
     """The same frame with another gain and falloff."""
     return replace(frame, gain=gain, camera=replace(frame.camera, falloff=falloff))
@@ -103,12 +142,14 @@ def _sightings(
         for k, (f, o) in enumerate(zip(frames, outlines, strict=True))
     ]
     if not parts:
-        return _Sightings(*(np.zeros(0, np.int64),) * 2, np.zeros((0, 3)), np.zeros(0))
+        nobody = np.zeros(0, np.int64)
+        return _Sightings(nobody, nobody, np.zeros((0, 3)), np.zeros(0), nobody)
     frame, cells, log, rho2 = (np.concatenate(column) for column in zip(*parts, strict=True))
-    _, point, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    shared = count[point] > 1
-    point = np.unique(point[shared], return_inverse=True)[1]
-    return _Sightings(frame[shared], point, log[shared], rho2[shared])
+    _, point, count = np.unique(cells, return_inverse=True, return_counts=True)
+    order = np.argsort(point, kind="stable")
+    order = order[count[point[order]] > 1]
+    first = np.diff(point[order], prepend=-1) > 0
+    return _Sightings(frame[order], np.cumsum(first) - 1, log[order], rho2[order], np.flatnonzero(first))
 
 
 def _sighting(
@@ -119,67 +160,128 @@ def _sighting(
     reach = 3 * (abs(pose.center[2] - pose.ground_h_m) + step)
     low = np.floor(np.maximum(outline.min(0), pose.center[:2] - reach) / step).astype(np.int64)
     high = np.ceil(np.minimum(outline.max(0), pose.center[:2] + reach) / step).astype(np.int64)
-    cols, rows = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
-    cells = np.column_stack((cols.ravel(), rows.ravel()))
-    ground = np.column_stack((cells * step, np.full(len(cells), pose.ground_h_m)))
-    ahead = (ground - pose.center) @ pose.world_R_cam[:, 2] > 0
-    cells, ground = cells[ahead], ground[ahead]
-    uv = pose.pixels(camera, ground)
-    share = (uv + 0.5) / (camera.width, camera.height)
     scale = params.side_px / max(thumb.shape[:2])
     size = (max(2, round(thumb.shape[1] * scale)), max(2, round(thumb.shape[0] * scale)))
-    small = cv2.resize(thumb[..., :3], size, interpolation=cv2.INTER_AREA).astype(np.float64)
-    inside = ((share > 0.5 / np.array(size)) & (share < 1 - 0.5 / np.array(size))).all(1)
-    colour = _bilinear(small, share[inside] * size - 0.5)
-    good = ((colour > params.darkest) & (colour < params.brightest)).all(1)
-    away = (uv[inside][good] - (camera.cx, camera.cy)) ** 2
-    rho2 = 4 * away.sum(1) / (camera.width**2 + camera.height**2)
-    return np.full(int(good.sum()), k), cells[inside][good], log_light(colour[good]), rho2
+    small = np.asarray(cv2.resize(thumb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    most = int(np.prod(high - low + 1))
+    cells, colour, rho2 = np.empty(most, np.int64), np.empty((most, 3)), np.empty(most)
+    found = _sight(
+        np.concatenate((low, high)),
+        step,
+        np.ascontiguousarray(pose.world_R_cam, np.float64),
+        np.array((*pose.center, pose.ground_h_m), np.float64),
+        intrinsics(camera),
+        small,
+        np.array((params.darkest, params.brightest)),
+        cells,
+        colour,
+        rho2,
+    )
+    return np.full(found, k), cells[:found], log_light(colour[:found]), rho2[:found]
 
 
-def _bilinear(image: Array, xy: Array) -> Array:
-    corner = np.clip(np.floor(xy).astype(int), 0, (image.shape[1] - 2, image.shape[0] - 2))
-    fx, fy = (xy - corner).T[..., None]
-    x, y = corner.T
-    upper = image[y, x] * (1 - fx) + image[y, x + 1] * fx
-    lower = image[y + 1, x] * (1 - fx) + image[y + 1, x + 1] * fx
-    return np.asarray(upper * (1 - fy) + lower * fy)
+@compiled
+def _sight(
+    box: Index,
+    step: float,
+    world_R_cam: Array,
+    place: Array,
+    lens: Array,
+    small: Thumb,
+    trusted: Array,
+    cells: Index,
+    colour: Array,
+    rho2: Array,
+) -> int:
+    """How many points of the lattice the picture shows in trusted colours; which, and how.
+
+    `box`: from and to which column and row. `place`: the camera's centre, and the height of the ground.
+    """
+    height, width = small.shape[:2]
+    count = 0
+    for col in range(box[0], box[2] + 1):
+        for row in range(box[1], box[3] + 1):
+            u, v, cos_view = project(col * step, row * step, place[3], world_R_cam, place[:3], lens)
+            x, y = (u + 0.5) / lens[6] * width - 0.5, (v + 0.5) / lens[7] * height - 0.5
+            if cos_view <= 0 or not (0 < x < width - 1 and 0 < y < height - 1):
+                continue
+            x0, y0 = int(x), int(y)
+            fx, fy = x - x0, y - y0
+            good = True
+            for c in range(3):
+                upper = small[y0, x0, c] * (1 - fx) + small[y0, x0 + 1, c] * fx
+                lower = small[y0 + 1, x0, c] * (1 - fx) + small[y0 + 1, x0 + 1, c] * fx
+                colour[count, c] = upper * (1 - fy) + lower * fy
+                good = good and trusted[0] < colour[count, c] < trusted[1]
+            if good:
+                cells[count] = (col << 32) + row
+                away = (u - lens[1]) ** 2 + (v - lens[2]) ** 2
+                rho2[count] = 4 * away / (lens[6] * lens[6] + lens[7] * lens[7])
+                count += 1
+    return count
 
 
 def _solve(seen: _Sightings, lens: Index, lenses: int, params: ExposureParams) -> tuple[Array, Array]:
-    """Gains (N, 3) and falloffs (C, 9): log light = point − log gain + falloff, iteratively reweighted."""
+    """Gains (N, 3) and falloffs (C, 9): log light = point − log gain + falloff."""
     n, m = len(lens), len(seen.frame)
-    powers = np.column_stack((seen.rho2, seen.rho2**2, seen.rho2**3))
     at = n + 3 * lens[seen.frame]
     cols = np.column_stack((seen.frame, at, at + 1, at + 2))
-    values = np.column_stack((-np.ones(m), powers))
+    values = np.column_stack((-np.ones(m), seen.powers))
     rows = np.repeat(np.arange(m), 4)
     design = sparse.csr_matrix((values.ravel(), (rows, cols.ravel())), shape=(m, n + 3 * lenses))
-    points = sparse.csr_matrix((np.ones(m), (np.arange(m), seen.point)))
     prior = np.full(n + 3 * lenses, params.falloff_sigma**-2)
     prior[:n] = params.gain_sigma**-2
-    answer, weight = np.zeros((n + 3 * lenses, 3)), np.ones(m)
-    for turn in range(params.iterations):
-        answer = _least_squares(design, points, weight / params.noise**2, seen.log, prior)
-        left = seen.log - design @ answer
-        mean = (points.T @ (weight[:, None] * left)) / (points.T @ weight)[:, None]
-        off = ((left - mean[seen.point]) ** 2).mean(1)
-        scale = max(params.outlier, params.doubt / 2**turn)
-        weight = 1 / (1 + off / scale**2) ** 2
+    answer = _reweighted(design, seen, prior, params, _sparsely)
     falloff = answer[n:].reshape(lenses, 3, 3).transpose(0, 2, 1).reshape(lenses, 9)
     # Rounded, so that a sum's last bits never show in a tile.
     return np.asarray(np.round(np.exp(answer[:n]), 5), float), np.round(falloff, 5)
 
 
-def _least_squares(
-    design: sparse.csr_matrix, points: sparse.csr_matrix, weight: Array, log: Array, prior: Array
+def _fit(
+    seen: _Sightings, frames: Sequence[PosedFrame], free: NDArray[np.bool_], params: ExposureParams
 ) -> Array:
+    """The gains (n, 3) of the n free ones among the frames."""
+    lenses = np.array([f.camera.falloff or (0.0,) * 9 for f in frames]).reshape(-1, 3, 3)
+    gains = np.array([(1.0, 1.0, 1.0) if new else f.gain for f, new in zip(frames, free, strict=True)])
+    known = np.log(gains)[seen.frame] - np.einsum("mcp,mp->mc", lenses[seen.frame], seen.powers)
+    design = -(seen.frame[:, None] == np.flatnonzero(free)).astype(float)
+    prior = np.full(design.shape[1], params.gain_sigma**-2)
+    even = replace(seen, log=seen.log + known)
+    return np.asarray(np.round(np.exp(_reweighted(design, even, prior, params, _densely)), 5), float)
+
+
+def _reweighted(
+    design: Design, seen: _Sightings, prior: Array, params: ExposureParams, solve: Solver
+) -> Array:
+    """The answer for which log light = point + design @ answer, when few may lie: iteratively reweighted."""
+    answer, weight = np.zeros((design.shape[1], 3)), np.ones(len(seen.frame))
+    for turn in range(params.iterations):
+        answer = solve(design, seen, weight / params.noise**2, prior)
+        left = seen.log - design @ answer
+        mean = seen.sums(weight[:, None] * left) / seen.sums(weight)[:, None]
+        off = ((left - mean[seen.point]) ** 2).mean(1)
+        scale = max(params.outlier, params.doubt / 2**turn)
+        weight = 1 / (1 + off / scale**2) ** 2
+    return answer
+
+
+def _sparsely(design: Design, seen: _Sightings, weight: Array, prior: Array) -> Array:
     """Weighted least squares with one free brightness per point and channel, eliminated beforehand."""
     weighted = sparse.diags(weight) @ design
-    share = (points.T @ weighted).tocsr()
-    inverse = sparse.diags(1 / (points.T @ weight))
+    points = sparse.csr_matrix((np.ones(len(weight)), (seen.point, np.arange(len(weight)))))
+    share = (points @ weighted).tocsr()
+    inverse = sparse.diags(1 / seen.sums(weight))
     normal = (design.T @ weighted - share.T @ inverse @ share + sparse.diags(prior)).tocsc()
-    right = weighted.T @ log - share.T @ (inverse @ (points.T @ (weight[:, None] * log)))
+    right = weighted.T @ seen.log - share.T @ (inverse @ seen.sums(weight[:, None] * seen.log))
     # Symmetric positive definite: no pivoting, or SuperLU takes forty times as long.
     factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return np.asarray(factor.solve(right))
+
+
+def _densely(design: Design, seen: _Sightings, weight: Array, prior: Array) -> Array:
+    """The same for a handful of frames."""
+    weighted = weight[:, None] * design
+    share, total = seen.sums(weighted), seen.sums(weight)[:, None]
+    normal = design.T @ weighted - share.T @ (share / total) + np.diag(prior)
+    right = weighted.T @ seen.log - share.T @ (seen.sums(weight[:, None] * seen.log) / total)
+    return np.asarray(np.linalg.solve(normal, right))

@@ -208,7 +208,7 @@ def warp(
 
 
 @compiled
-def _project(
+def project(
     x: float,
     y: float,
     h_m: float,
@@ -243,7 +243,7 @@ def _knots(
 ) -> None:
     limit_x, limit_y = min(2 * lens[6], 32000.0), min(2 * lens[7], 32000.0)
     for k in range(foot.shape[0]):
-        u, v, cos_view = _project(
+        u, v, cos_view = project(
             foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m, h_m, world_R_cam, center, lens
         )
         if cos_view < min_cos_view:
@@ -310,7 +310,7 @@ def _look(
         x, y = foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m
         if (x - center[0]) ** 2 + (y - center[1]) ** 2 > reach_m * reach_m:
             continue
-        u, v, cos_view = _project(x, y, h_m, world_R_cam, center, lens)
+        u, v, cos_view = project(x, y, h_m, world_R_cam, center, lens)
         if cos_view < min_cos_view:
             continue
         w = _weight(u, v, cos_view, width, height, importance, skirt_px)
