@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 
 from core.coverage import FUSION, Encoded, block_grid, blocks, draw_block, overview, quarter, tiles_under
@@ -19,7 +20,7 @@ from services.tables import Mission
 from workers import warmup
 from workers.app import Stopwatch, before_the_fork, db, go_on, log, settings, stage, store
 from workers.photos import FileGone, MissionPhotos, shelf
-from workers.pictures import Pictures, put_tile
+from workers.pictures import Pictures, putting
 
 before_the_fork(warmup.rendering)
 
@@ -113,28 +114,30 @@ def _redrawn(
         return done, 0
     photos = MissionPhotos(shelf, mission.id, mission.tile_side)
     found = draw_block(left, known.world, index, photos)
-    made = [put_tile(store, mission.id, wanted[t].generation, t, p, inputs[t]) for t, p in found.items()]
+    put = [putting(store, mission.id, wanted[t].generation, t, p, inputs[t]) for t, p in found.items()]
     if len(left) == len(wanted) and mission.final_generation is not None:
-        made = _with_above(mission.id, made, found)
+        made = _with_above(mission.id, put, found)
+    else:
+        made = [begun.result() for begun in put]
     grid = block_grid(left)
     return [*done, *made], grid.width * grid.height
 
 
 def _with_above(
-    mission_id: str, made: Sequence[Render], found: Mapping[TileKey, Encoded | None]
+    mission_id: str, put: Sequence[Future[Render]], found: Mapping[TileKey, Encoded | None]
 ) -> list[Render]:
     """Siblings, all of which were drawn now, with their overview on one of them: publish finds it ready."""
+    above = parent(next(iter(found)))
+    encoded = [found.get(child) for child in children(above)]
+    picture = overview([None if e is None else quarter(e[0]) for e in encoded])
+    over = putting(store, mission_id, 0, above, picture).result()
+    made = [begun.result() for begun in put]
     pictures_of = {TileKey(*r.key): r.object_key for r in made if r.object_key is not None}
     if not pictures_of:
-        return list(made)
+        return made
     first = min(pictures_of)
-    above = parent(first)
-    encoded = [found.get(child) for child in children(above)]
-    put = put_tile(
-        store, mission_id, 0, above, overview([None if e is None else quarter(e[0]) for e in encoded])
-    )
     of = tuple(pictures_of.get(child) for child in children(above))
-    ready = Above(of, put.object_key, put.etag, put.media_type, put.size_bytes)
+    ready = Above(of, over.object_key, over.etag, over.media_type, over.size_bytes)
     return [replace(r, above=ready) if r.key == first else r for r in made]
 
 
@@ -149,12 +152,12 @@ def _filled(
     index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], FUSION)
     photos = MissionPhotos(shelf, mission.id, mission.tile_side)
     patched = fill_block(shown, known.world, index, photos)
-    return [_patch(mission.id, tile, wanted[tile], patched.changed) for tile in block], patched.pixels
+    put = [putting(store, mission.id, wanted[t].generation, t, p) for t, p in patched.changed.items()]
+    kept = [_as_shown(tile, wanted[tile]) for tile in block if tile not in patched.changed]
+    return [*kept, *(begun.result() for begun in put)], patched.pixels
 
 
-def _patch(mission_id: str, tile: TileKey, todo: ToDraw, changed: Mapping[TileKey, Encoded | None]) -> Render:
-    if tile in changed:
-        return put_tile(store, mission_id, todo.generation, tile, changed[tile])
+def _as_shown(tile: TileKey, todo: ToDraw) -> Render:
     return replace(todo.shown or Render(tile, todo.generation), generation=todo.generation)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 
 from core.coverage import overview, quarter, top_zoom
@@ -13,7 +14,7 @@ from services.errors import RevisionConflict
 from services.queue import send
 from services.tables import Mission
 from workers.app import CLAIM_TTL_S, Stopwatch, db, log, settings, stage, store
-from workers.pictures import Pictures, put_tile
+from workers.pictures import Pictures, putting
 
 quarters = Pictures(store, settings.tile_cache_bytes // 2, quarter)
 ENOUGH, ENOUGH_LIVE = 128, 24
@@ -116,14 +117,17 @@ def _overviews(
 
     ready = {parent(tile): render.above for tile, render in below.items() if render.above is not None}
 
-    def made(tile: TileKey) -> Render:
+    made, put = dict[TileKey, Render](), dict[TileKey, Future[Render]]()
+    for tile in stale:
         of = tuple(picture_key(c) for c in children(tile))
         above = ready.get(tile)
         if above is not None and above.of == of:
-            return Render(tile, generation, above.object_key, above.etag, above.media_type, above.size_bytes)
-        return put_tile(store, mission_id, generation, tile, overview([quarters.get(key) for key in of]))
-
-    return {tile: made(tile) for tile in stale}
+            picture = above.object_key, above.etag, above.media_type, above.size_bytes
+            made[tile] = Render(tile, generation, *picture)
+        else:
+            picture_of = overview([quarters.get(key) for key in of])
+            put[tile] = putting(store, mission_id, generation, tile, picture_of)
+    return made | {tile: begun.result() for tile, begun in put.items()}
 
 
 def _top(mission: Mission, renders: Mapping[TileKey, Render], bounds: TileBox | None, partly: bool) -> int:

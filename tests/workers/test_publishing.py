@@ -17,7 +17,7 @@ def test_the_final_pass_leaves_no_overview_of_native_tiles_to_publish(
 ) -> None:
     publish = bench.modules["publish"]
     made: list[int] = []
-    really = publish.put_tile
+    really = publish.putting
 
     def remember(store: Any, mission_id: str, generation: int, tile: Any, encoded: Any) -> Any:
         if encoded is not None:
@@ -26,7 +26,7 @@ def test_the_final_pass_leaves_no_overview_of_native_tiles_to_publish(
 
     bench.upload(photos)
     bench.drain()
-    monkeypatch.setattr(publish, "put_tile", remember)
+    monkeypatch.setattr(publish, "putting", remember)
     bench.finalise()
     bench.drain()
     with bench.db.read() as tx:
