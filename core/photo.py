@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from io import BytesIO
+from io import SEEK_END, BytesIO
+from typing import BinaryIO
 
 from PIL import JpegImagePlugin, TiffImagePlugin
 
@@ -38,47 +39,55 @@ def probe(data: bytes, limits: PhotoLimits = PhotoLimits()) -> PhotoHeader:
 
     Raises EmptyFile, FileTooLarge, NotAnImage, TruncatedImage, TooManyPixels, TooFewPixels.
     """
-    if not data:
+    return probe_file(BytesIO(data), limits)
+
+
+def probe_file(photo: BinaryIO, limits: PhotoLimits = PhotoLimits()) -> PhotoHeader:
+    """As `probe`, of a stream that can be sought in: no more than the header of it is read."""
+    size_bytes = photo.seek(0, SEEK_END)
+    if not size_bytes:
         raise EmptyFile
-    if len(data) > limits.max_bytes:
+    if size_bytes > limits.max_bytes:
         raise FileTooLarge(
-            f"The file has {len(data) / 1e6:.0f} MB, more than the limit of {limits.max_bytes / 1e6:.0f} MB. "
-            "Export a smaller JPEG of it."
+            f"The file has {size_bytes / 1e6:.0f} MB, more than the limit of "
+            f"{limits.max_bytes / 1e6:.0f} MB. Export a smaller JPEG of it."
         )
-    header = _header(data)
+    header = _header(photo, size_bytes)
     _check_size(header, limits)
     return header
 
 
-def _header(data: bytes) -> PhotoHeader:
-    if data.startswith(_JPEG_MAGIC):
-        return PhotoHeader("JPEG", *_jpeg_size(data), "image/jpeg")
-    if data.startswith(_TIFF_MAGICS):
-        return PhotoHeader("TIFF", *_tiff_size(data), "image/tiff")
+def _header(photo: BinaryIO, size_bytes: int) -> PhotoHeader:
+    photo.seek(0)
+    start = photo.read(8)
+    photo.seek(0)
+    if start.startswith(_JPEG_MAGIC):
+        return PhotoHeader("JPEG", *_jpeg_size(photo), "image/jpeg")
+    if start.startswith(_TIFF_MAGICS):
+        return PhotoHeader("TIFF", *_tiff_size(photo, start, size_bytes), "image/tiff")
     # A copy cut within the first bytes is a torn photo, not a foreign file.
-    if any(magic.startswith(data) for magic in (_JPEG_MAGIC, *_TIFF_MAGICS)):
+    if any(magic.startswith(start) for magic in (_JPEG_MAGIC, *_TIFF_MAGICS)):
         raise TruncatedImage
     raise NotAnImage
 
 
-def _jpeg_size(data: bytes) -> tuple[int, int]:
+def _jpeg_size(photo: BinaryIO) -> tuple[int, int]:
     # The plugin itself, not Image.open: that one warns or raises by a process-wide pixel limit of its own.
     try:
-        width, height = JpegImagePlugin.JpegImageFile(BytesIO(data)).size
+        width, height = JpegImagePlugin.JpegImageFile(photo).size
     except Exception as error:  # Pillow's plugins raise whatever struct, int and zip do on torn headers
         raise TruncatedImage from error
     return width, height
 
 
-def _tiff_size(data: bytes) -> tuple[int, int]:
+def _tiff_size(photo: BinaryIO, start: bytes, size_bytes: int) -> tuple[int, int]:
     # The directory alone: Pillow's TIFF plugin refuses pixel types that the decoder can read.
     try:
-        directory = TiffImagePlugin.ImageFileDirectory_v2(data[:8])
-        if directory.next < 8 or directory.next >= len(data):
+        directory = TiffImagePlugin.ImageFileDirectory_v2(start)
+        if directory.next < 8 or directory.next >= size_bytes:
             raise TruncatedImage
-        stream = BytesIO(data)
-        stream.seek(directory.next)
-        directory.load(stream)
+        photo.seek(directory.next)
+        directory.load(photo)
         return int(directory[_WIDTH_TAG]), int(directory[_HEIGHT_TAG])
     except Exception as error:
         raise TruncatedImage from error

@@ -42,15 +42,18 @@ class Database:
         self.engine = _sqlite_engine(self.url) if self.is_sqlite else _postgres_engine(self.url)
         self._writer = self.engine.execution_options(orthostream_write=_DURABLE)
         self._hasty_writer = self.engine.execution_options(orthostream_write=_HASTY)
+        # One connection for both kinds would compile all of its statements anew at every change.
+        self._reads = _sqlite_engine(self.url) if self._is_file else self.engine
         self._reader = (
-            self.engine
+            self._reads
             if self.is_sqlite
             else self.engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
         )
         self._turn: AbstractContextManager[None] = (
             _Turn(f"{self.url.database}.lock") if self._is_file else nullcontext()
         )
-        _forget_connections_in_children(self.engine)
+        for engine in {self.engine, self._reads}:
+            _forget_connections_in_children(engine)
 
     @property
     def _is_file(self) -> bool:
@@ -101,7 +104,8 @@ class Database:
 
     def close(self) -> None:
         """Close the pooled connections."""
-        self.engine.dispose()
+        for engine in {self.engine, self._reads}:
+            engine.dispose()
 
 
 class _Turn:

@@ -9,7 +9,7 @@ import shutil
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, Protocol
 from urllib.parse import unquote, urlsplit
@@ -30,8 +30,11 @@ class ObjectStore(Protocol):
     def put(self, key: str, data: bytes) -> None:
         """Store `data`, replacing what was there. Raises BadKey, OutOfDisk."""
 
-    def put_file(self, key: str, path: Path) -> None:
-        """Store a copy of the file. Raises BadKey, OutOfDisk."""
+    def put_file(self, key: str, path: Path, move: bool = False) -> None:
+        """Store a copy of the file, or, with `move`, the file itself, which is gone then.
+
+        Raises BadKey, OutOfDisk.
+        """
 
     def get(self, key: str) -> bytes:
         """All bytes. Raises BadKey, ObjectNotFound."""
@@ -83,14 +86,18 @@ class FolderStore:
 
         self._put(key, len(data), write)
 
-    def put_file(self, key: str, path: Path) -> None:
+    def put_file(self, key: str, path: Path, move: bool = False) -> None:
         """See ObjectStore."""
 
         def write(file: BinaryIO) -> None:
             with path.open("rb") as source:
                 shutil.copyfileobj(source, file, 1 << 20)
 
+        if move and self._take(key, path):
+            return
         self._put(key, path.stat().st_size, write)
+        if move:
+            path.unlink()
 
     def get(self, key: str) -> bytes:
         """See ObjectStore."""
@@ -158,17 +165,29 @@ class FolderStore:
         self._check_space(size_bytes)
         temp = self._temp / uuid.uuid4().hex
         try:
-            with temp.open("xb") as file:
-                write(file)
-                file.flush()
-                os.fsync(file.fileno())
-            self._move(temp, path)
-        except OSError as error:
-            if error.errno in _FULL:
-                raise OutOfDisk() from error
-            raise
+            with _full_disk_told():
+                with temp.open("xb") as file:
+                    write(file)
+                    file.flush()
+                    os.fsync(file.fileno())
+                self._move(temp, path)
         finally:
             temp.unlink(missing_ok=True)
+
+    def _take(self, key: str, path: Path) -> bool:
+        """Whether the file could be moved: not from one disk to another."""
+        target = self._path(key)
+        self._check_space(0)
+        try:
+            with _full_disk_told():
+                with path.open("rb") as file:
+                    os.fsync(file.fileno())
+                self._move(path, target)
+        except OSError as error:
+            if error.errno != errno.EXDEV:
+                raise
+            return False
+        return True
 
     def _check_space(self, size_bytes: int) -> None:
         # Refusing early leaves the database the room it needs to stay consistent.
@@ -179,13 +198,13 @@ class FolderStore:
     def _move(self, temp: Path, path: Path) -> None:
         for attempt in range(10):
             try:
-                self._durable.difference_update(_missing(path.parent, self.root))
-                path.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(temp, path)
                 break
-            except FileNotFoundError:  # delete_prefix took the folder away in between
+            except FileNotFoundError:  # a new folder, or delete_prefix took it away
                 if attempt == 9:
                     raise
+                self._durable.difference_update(_missing(path.parent, self.root))
+                path.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):  # it took the object away as well: nothing is left to keep
             self._sync_names(path.parent)
 
@@ -203,6 +222,16 @@ class FolderStore:
             with suppress(FileNotFoundError):
                 if temp.stat().st_mtime < time.time() - _TEMP_LIFETIME_S:
                     temp.unlink()
+
+
+@contextmanager
+def _full_disk_told() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise OutOfDisk() from error
+        raise
 
 
 def get_store(settings: Settings) -> ObjectStore:

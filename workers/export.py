@@ -108,8 +108,9 @@ def _made(mission: Mission, wanted: Export) -> tuple[str, int]:
         path = Path(folder) / wanted.name
         make(path, mission, wanted)
         key = f"missions/{mission.id}/exports/{wanted.revision}-{wanted.generation}/{wanted.name}"
-        store.put_file(key, path)
-        return key, os.stat(path).st_size
+        size_bytes = os.stat(path).st_size
+        store.put_file(key, path, move=True)
+        return key, size_bytes
 
 
 def _known(mission_id: str) -> tuple[Poses, list[Seen]]:

@@ -43,20 +43,21 @@ class Services:
     accepting: asyncio.Semaphore
 
 
-def _services(request: Request) -> Services:
+# Coroutines, or each would be handed to a thread and back.
+async def _services(request: Request) -> Services:
     services: Services = request.app.state.services
     return services
 
 
-def _mission_id(mission_id: Annotated[str, PathParameter(description="The mission's id")]) -> str:
+async def _mission_id(mission_id: Annotated[str, PathParameter(description="The mission's id")]) -> str:
     # Whatever cannot be an id needs no query; some of it the database would choke on.
     if not _MISSION_ID.fullmatch(mission_id):
         raise MissionNotFound(f"There is no mission {mission_id[:50]!r}.")
     return mission_id
 
 
-def _public_url(request: Request) -> str:
-    settings = _services(request).settings
+async def _public_url(request: Request) -> str:
+    settings = (await _services(request)).settings
     # Unless somebody said where we are to be found, the caller's own way here is the one that works.
     if settings.public_url == f"http://{settings.host}:{settings.port}":
         return str(request.base_url).rstrip("/")

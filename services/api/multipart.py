@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
+import uuid
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
@@ -76,8 +75,7 @@ class FormReader:
     def feed(self, chunks: Iterable[bytes]) -> None:
         """Take more of the body. Raises BadUpload, TooManyPhotos, OSError."""
         try:
-            for chunk in chunks:
-                self._parser.write(chunk)
+            self._parser.write(b"".join(chunks))
         except FormParserError as error:
             raise BadUpload(f"The multipart body is damaged: {error}.") from error
 
@@ -152,10 +150,9 @@ class _Incoming:
     """One photo being written; past the limit it is only counted and hashed any more."""
 
     def __init__(self, name: str, folder: Path, limit: int) -> None:
-        handle, path = tempfile.mkstemp(prefix="upload-", dir=folder)
         self._name, self._limit = name, limit
-        self._path: Path | None = Path(path)
-        self._file: BinaryIO = os.fdopen(handle, "wb", buffering=0)
+        self._path: Path | None = folder / f"upload-{uuid.uuid4().hex}"
+        self._file = self._path.open("xb", buffering=0)
         self._digest = hashlib.sha256()
         self._size = 0
 

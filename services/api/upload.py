@@ -13,7 +13,7 @@ from fastapi import APIRouter, Request, Response
 from starlette.requests import ClientDisconnect
 
 from core.errors import BadTelemetry, FileTooLarge, OrthostreamError, RejectedFrame
-from core.photo import PhotoHeader, probe
+from core.photo import PhotoHeader, probe_file
 from core.telemetry import parse_telemetry
 from services.api.context import MissionId, Services, Use
 from services.api.documents import FrameState, UploadedFrame, UploadOut
@@ -26,7 +26,7 @@ from services.errors import OutOfDisk
 router = APIRouter(tags=["frames"])
 
 # Chunks arrive in 64 kB; handed to a thread in larger lots, hashing and writing leave the event loop free.
-_LOT_BYTES = 512_000
+_LOT_BYTES = 1_000_000
 
 _FORM = {
     "required": True,
@@ -58,13 +58,10 @@ _FORM = {
     "/missions/{mission_id}/frames",
     status_code=201,
     response_model=UploadOut,
-    response_model_exclude_none=True,
     responses={200: {"model": UploadOut, "description": "Every photo was here already"}},
     openapi_extra={"requestBody": _FORM},
 )
-async def upload_frames(
-    mission_id: MissionId, request: Request, response: Response, services: Use
-) -> UploadOut:
+async def upload_frames(mission_id: MissionId, request: Request, services: Use) -> Response:
     """Upload photos. 201 when one of them is new, 200 when all were here already.
 
     Each photo has a result of its own; only when every one is refused the answer is an error, with the
@@ -76,8 +73,9 @@ async def upload_frames(
     if not any(isinstance(r, UploadedFrame) for r in results):
         raise _refusal([r for r in results if isinstance(r, _Refused)])
     documents = [r if isinstance(r, UploadedFrame) else r.document for r in results]
-    response.status_code = 201 if any(d.created for d in documents) else 200
-    return UploadOut(frames=documents)
+    said = UploadOut(frames=documents).model_dump_json(exclude_none=True)
+    status = 201 if any(d.created for d in documents) else 200
+    return Response(said, status, media_type="application/json")
 
 
 class _Refused:
@@ -162,7 +160,7 @@ class _Upload:
 
 def _check_room(services: Services, mission_id: str) -> None:
     with services.db.read() as tx:
-        missions.get(tx, mission_id)
+        missions.check(tx, mission_id)
     # Before the first byte is read: a full disk must not cost the sender an upload.
     free, kept = shutil.disk_usage(services.uploads).free, services.settings.min_free_bytes
     if free < kept:
@@ -195,7 +193,7 @@ def _keep(
     if known is not None and known.code not in NOT_ITS_FAULT:
         return _uploaded(known, file, created=False)
     assert file.path is not None  # the probe refuses what is larger than the limit
-    services.store.put_file(f"missions/{mission_id}/photos/{file.frame_id}", file.path)
+    services.store.put_file(f"missions/{mission_id}/photos/{file.frame_id}", file.path, move=True)
     if known is not None:
         return _tried_again(services, mission_id, file)
     with services.db.write() as tx:
@@ -226,7 +224,8 @@ def _probe(services: Services, file: ReceivedFile) -> PhotoHeader:
             f"The file has {file.size_bytes / 1e6:.0f} MB, more than the limit of "
             f"{limits.max_bytes / 1e6:.0f} MB. Export a smaller JPEG of it."
         )
-    return probe(file.path.read_bytes(), limits)
+    with file.path.open("rb") as photo:
+        return probe_file(photo, limits)
 
 
 def _uploaded(there: Upload, file: ReceivedFile, created: bool) -> UploadedFrame:

@@ -14,6 +14,7 @@ from core.scale import UNKNOWN, KnownScale
 from services.catalog import events, frames, leases, sharpening, tiles
 from services.catalog.rows import MISSION, clock, hold, in_step, lock, mission, table
 from services.catalog.wakes import Wake
+from services.errors import MissionNotFound
 from services.tables import DirtyTile, Frame, Mission, Tile
 
 _ALPHABET = "abcdefghijkmnpqrstuvwxyz23456789"  # no l, o, 0, 1: ids are read out over the radio
@@ -21,6 +22,7 @@ _RATE_WINDOW_S = 30.0
 _ENDING = ("finalising", "sharpening")
 _UNDER_WAY = ("open", *_ENDING)
 
+_STATE = select(MISSION.state).where(MISSION.id == bindparam("mission"))
 _SPENT = select(MISSION.stage_seconds).where(MISSION.id == bindparam("mission"))
 _PIXELS = select(MISSION.pixels).where(MISSION.id == bindparam("mission"))
 _CHANGE = update(table(Mission)).where(MISSION.id == bindparam("mission"))
@@ -91,6 +93,12 @@ def create(
 def get(tx: Session, mission_id: str) -> Mission:
     """The mission's row; raises MissionNotFound."""
     return mission(tx, mission_id)
+
+
+def check(tx: Session, mission_id: str) -> None:
+    """Raises MissionNotFound when there is none or it is being deleted."""
+    if tx.execute(_STATE, {"mission": mission_id}).scalar() in (None, "deleting"):
+        raise MissionNotFound(f"There is no mission {mission_id!r}.")
 
 
 def list(tx: Session, limit: int = 100, after: str | None = None) -> Sequence[Mission]:

@@ -60,6 +60,30 @@ class TestObjectStore:
         assert store.exists("missions/m/photos/a")
         assert (tmp_path / "file").exists()
 
+    @pytest.mark.parametrize("other_disk", [False, True])
+    def test_a_file_that_is_moved_in_is_gone(
+        self, store: ObjectStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other_disk: bool
+    ) -> None:
+        file, replace = tmp_path / "file", os.replace
+
+        def between_disks(source: Path, target: Path) -> None:
+            if source == file:
+                raise OSError(errno.EXDEV, "Invalid cross-device link")
+            replace(source, target)
+
+        if other_disk:
+            monkeypatch.setattr(os, "replace", between_disks)
+        for key in ("a/b/c", "a/b/c", "a/d"):
+            file.write_bytes(key.encode())
+            store.put_file(key, file, move=True)
+            assert not file.exists()
+            assert store.get(key) == key.encode()
+        file.write_bytes(b"kept")
+        with pytest.raises(BadKey):
+            store.put_file("../c", file, move=True)
+        assert file.read_bytes() == b"kept"
+        assert list(store.list()) == ["a/b/c", "a/d"]
+
     def test_what_is_not_there_is_said_to_be_missing(self, store: ObjectStore) -> None:
         store.put("a/b", b"1")
         for key in ("a", "a/b/c", "nothing"):

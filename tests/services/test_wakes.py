@@ -80,10 +80,9 @@ def test_known_frames_are_seen_in_their_new_state_without_being_read_again(
     def note(*call: object) -> None:
         asked.append(str(call[2]))
 
-    event.listen(db.engine, "before_cursor_execute", note)
     with db.read() as tx:
+        event.listen(tx.connection(), "before_cursor_execute", note)
         seen = frames.sightings(tx, mission_id, before)
         assert seen == frames.sightings(tx, mission_id)
-    event.remove(db.engine, "before_cursor_execute", note)
     assert [(s.frame_id, s.state) for s in seen] == [("a", "ready"), ("b", "matched"), ("c", "ready")]
     assert sum("frames.meta \n" in statement for statement in asked) == (known != "abc") + 1

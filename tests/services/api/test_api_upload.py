@@ -200,7 +200,7 @@ def test_an_unknown_mission_takes_nothing(api: TestClient, jpeg: Jpeg) -> None:
 def test_a_full_disk_says_so_and_keeps_the_rest(
     api: TestClient, services: Services, mission_url: str, jpeg: Jpeg, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OutOfDisk
 
     monkeypatch.setattr(type(services.store), "put_file", full)
