@@ -126,7 +126,7 @@ class MosaicPlan:
         for level in range(self.levels if shows else 0):
             rgba = halve(rgba) if level else rgba
             box = _scaled(piece, level)
-            with rasterio.open(folder / _file(piece, level), "w", **self._profile(box)) as out:
+            with rasterio.open(folder / _file(piece, level), "w", **self._profile(box, level)) as out:
                 out.write(rgba[: box[3], : box[2]].transpose(2, 0, 1))
         (folder / _mark(piece)).write_bytes(SHOWS if shows else b"")
 
@@ -134,9 +134,9 @@ class MosaicPlan:
         """Whether all of the piece lies in `folder`."""
         return (folder / _mark(piece)).exists()
 
-    def _profile(self, box: Box) -> dict[str, Any]:
+    def _profile(self, box: Box, level: int) -> dict[str, Any]:
         kind = {"driver": "GTiff", "photometric": "RGB", "alpha": "YES"}
-        place = {"transform": rasterio.Affine.translation(*box[:2])}
+        place = {"transform": self._to_crs(level) @ rasterio.Affine.translation(*box[:2])}
         size = {"width": box[2], "height": box[3], "count": 4, "dtype": "uint8"}
         blocks = {"tiled": True, "blockxsize": self.params.block_px, "blockysize": self.params.block_px}
         # Zstandard packs as well as deflate in half the time; GDAL alone will read it.
@@ -165,12 +165,15 @@ class MosaicPlan:
         shown = [p for p in self.pieces() if (folder / _mark(p)).read_bytes() == SHOWS]
         rasters = []
         for level in range(self.levels):
-            gsd_m = self.grid.gsd_m * (1 << level)
-            to_crs = rasterio.Affine(gsd_m, 0, self.grid.left, 0, -gsd_m, self.grid.top)
             size = _scaled((0, 0, self.grid.width, self.grid.height), level)[2:]
             patches = [Patch(_file(p, level), *_scaled(p, level)) for p in shown]
-            rasters.append(Virtual(*size, to_crs, f"EPSG:{self.grid.epsg}", patches, tags))
+            rasters.append(Virtual(*size, self._to_crs(level), f"EPSG:{self.grid.epsg}", patches, tags))
         return write_virtual(folder, rasters)
+
+    def _to_crs(self, level: int) -> rasterio.Affine:
+        """Pixel corners of an overview → metres."""
+        gsd_m = self.grid.gsd_m * (1 << level)
+        return rasterio.Affine(gsd_m, 0, self.grid.left, 0, -gsd_m, self.grid.top)
 
 
 def write_mosaic(
