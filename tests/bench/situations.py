@@ -33,33 +33,38 @@ from tests.flights.missions import (
 )
 
 Line = dict[str, Any]
+Measure = Callable[[list[Mission]], Line]
 SEEN = LandmarkParams(keypoints=300)
 RELIEFS_M = (0.0, 2.0, 10.0)
 SIGMA_RELIEFS_M = (0.0, 2.0, 10.0, 30.0)
 SIGMA_FRAMES = 72
 
 
-def situations(frames: int, seeds: Sequence[int]) -> Iterator[Line]:
-    """A line of figures for each situation, as soon as it is measured."""
+def situations(frames: int, seeds: Sequence[int], only: str = "") -> Iterator[Line]:
+    """A line of figures for each situation whose name holds `only`, as soon as it is measured."""
+    for name, params, measure in _all(frames):
+        if only in name:
+            yield _line(name, params, seeds, measure)
+
+
+def _all(frames: int) -> Iterator[tuple[str, FlightParams, Measure]]:
     plan = FlightParams(frames=frames, drones=1, gps_noise_m=2.0)
     for relief_m in RELIEFS_M:
-        yield _line(f"2 m GPS, relief {relief_m:g} m", replace(plan, relief_m=relief_m), seeds, _accuracy)
+        yield f"2 m GPS, relief {relief_m:g} m", replace(plan, relief_m=relief_m), _accuracy
     low = replace(plan, forward_overlap=0.4, side_overlap=0.3)
-    yield _line("2 m GPS, overlap 40/30", low, seeds, _togetherness)
-    yield _line("2 m GPS, three interruptions", plan, seeds, _interruptions)
+    yield "2 m GPS, overlap 40/30", low, _togetherness
+    yield "2 m GPS, three interruptions", plan, _interruptions
     blind = replace(plan, no_gps=1.0)
-    yield _line("no GPS, three interruptions", blind, seeds, _interruptions)
+    yield "no GPS, three interruptions", blind, _interruptions
     for relief_m in RELIEFS_M[:2]:
         named = f"no GPS, first height known, relief {relief_m:g} m"
-        yield _line(named, replace(blind, relief_m=relief_m), seeds, _route)
+        yield named, replace(blind, relief_m=relief_m), _route
     for relief_m in SIGMA_RELIEFS_M:
         smaller = replace(plan, frames=SIGMA_FRAMES, relief_m=relief_m)
-        yield _line(f"sigma, 2 m GPS, relief {relief_m:g} m", smaller, seeds, _sigmas)
+        yield f"sigma, 2 m GPS, relief {relief_m:g} m", smaller, _sigmas
 
 
-def _line(
-    name: str, params: FlightParams, seeds: Sequence[int], measure: Callable[[list[Mission]], Line]
-) -> Line:
+def _line(name: str, params: FlightParams, seeds: Sequence[int], measure: Measure) -> Line:
     flights = [mission(replace(params, seed=seed), SEEN) for seed in seeds]
     head = {
         "situation": name,
