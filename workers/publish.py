@@ -21,6 +21,8 @@ ENOUGH, ENOUGH_LIVE = 128, 24
 """Tiles that are worth a revision of their own while others are still drawn: every revision has its price,
 the overviews up to the top.
 """
+LAST_TILES = 8
+"""So many a worker are still drawn when the last but one revision is published."""
 
 
 @stage("publish")
@@ -40,8 +42,8 @@ def publish(mission_id: str) -> None:
             break
         sharpens = mission.sharp_zoom is not None
         final = mission.final_generation is not None and not sharpens
-        more = desk.in_flight + (desk.to_render if final else 0) > 0
-        if more and len(pending) < (ENOUGH if final else ENOUGH_LIVE):
+        more = desk.in_flight + (desk.to_render if final else 0)
+        if more and not _worth_it(len(pending), more, final):
             break  # whoever draws the last of them wakes us
         left = awaited - {render.key for render in pending}
         try:
@@ -56,6 +58,15 @@ def publish(mission_id: str) -> None:
             continue
         log.info("published", mission=mission_id, revision=revision, tiles=len(changes))
     send("sequence", mission_id)
+
+
+def _worth_it(rendered: int, more: int, final: bool) -> bool:
+    """Whether tiles are shown while `more` are still drawn. When all are, everybody waits for the overviews:
+    those of most tiles are made before, while the others draw the last few.
+    """
+    if not final:
+        return rendered >= ENOUGH_LIVE
+    return rendered >= ENOUGH or (more <= LAST_TILES * settings.workers and rendered >= 2 * more)
 
 
 @contextmanager

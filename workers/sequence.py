@@ -38,8 +38,10 @@ FEW = 8
 LIVE_TILES = 12
 WORTH_A_LOOK = 24
 """While so many photos still wait to be read, a mission that is being finished grows live as well."""
-REST_S = 4.0
-"""Pause between batches of the live map while photos wait to be read: it grows, and reading goes on."""
+REST_CORE_S = 20.0
+"""Between batches of the live map so much is worked on photos that wait to be read: it grows, and they go on,
+with few workers as with many.
+"""
 _REMEMBERED = 8
 IDLE = Backlog(0, 0, 0, 0, 0)
 
@@ -323,7 +325,7 @@ def _dispatch(mission: Mission, desk: Backlog) -> bool:
     now = time.monotonic()
     if room <= 0 or (busy and now < _rested.get(mission.id, 0.0)):
         return False
-    _rested[mission.id] = now + REST_S
+    _rested[mission.id] = now + REST_CORE_S / settings.workers
     with db.write() as tx:
         claimed = tiles.claim_dirty(tx, mission.id, room, CLAIM_TTL_S, by_place=sharpens)
     keys = [(d.z, d.x, d.y) for d in claimed]
