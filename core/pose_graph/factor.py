@@ -153,14 +153,3 @@ def solution(factor: Factor, n: int) -> tuple[Array, Array]:
         mine = dtrsv(factor.lower[k], y, lower=1, trans=1)
         x[front.nodes[: front.pivots]] = mine.reshape(-1, factor.d)
     return x, shared
-
-
-def solve_blocks(
-    fronts: tuple[Front, ...], frame: Array, pair: Array, rhs: Array, border: Border | None = None
-) -> tuple[Array, Array] | None:
-    """Solution (N, d) and (B,) of H·x = `rhs` (N, d); None where H is not positive definite."""
-    factor = factorise(fronts, frame, pair, rhs, border)
-    if factor is None:
-        return None
-    x, y = solution(factor, len(frame))
-    return (x, y) if np.isfinite(x).all() and np.isfinite(y).all() else None

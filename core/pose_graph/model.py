@@ -74,7 +74,6 @@ class PoseParams:
     gimbal_start_rad: float = 0.05
     gimbal_sigma_rad: float = 0.03
     yaw_sigma_rad: float = 0.5
-    height_log_sigma: float = 0.4
     focal_log_sigma: float = 0.005
     focal_frames: int = 100
     k1_sigma: float = 0.1

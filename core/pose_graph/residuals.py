@@ -17,7 +17,6 @@ from core.compiled import compiled_loosely
 from core.geometry import Array
 
 IntArray = NDArray[np.int64]
-FRAME_DOF = 7
 CAMERA_DOF = 3
 # A ray closer to the horizon than this, or a point this close to the image plane, says nothing of the ground.
 MIN_DOWN = 0.05

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from core.pose_graph.chaining import chained
-from core.pose_graph.elimination import plan
-from core.pose_graph.factor import Border, factorise, solve_blocks
+from core.pose_graph.elimination import Front, plan
+from core.pose_graph.factor import Border, factorise, solution
 from core.pose_graph.marginals import covariances
 
 D, SHARED = 3, 2
@@ -63,6 +63,17 @@ def system(n: int, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
         cross[j] += A[D : 2 * D, 2 * D :]
         shared += A[2 * D :, 2 * D :]
     return frame, pair, rng.normal(size=(n, D)), Border(cross, shared, rng.normal(size=SHARED)), dense
+
+
+def solve_blocks(
+    fronts: tuple[Front, ...],
+    frame: np.ndarray,
+    pair: np.ndarray,
+    rhs: np.ndarray,
+    border: Border | None = None,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    factor = factorise(fronts, frame, pair, rhs, border)
+    return None if factor is None else solution(factor, len(frame))
 
 
 @pytest.mark.parametrize("name", GRAPHS)
