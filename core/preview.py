@@ -33,7 +33,7 @@ class Preview:
     def png(self) -> bytes:
         """The picture."""
         out = io.BytesIO()
-        Image.fromarray(self.rgba, "RGBA").save(out, "PNG")
+        Image.fromarray(self.rgba, "RGBA").save(out, "PNG", compress_level=3)
         return out.getvalue()
 
     def world_file(self) -> str:
