@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import JpegImagePlugin, TiffImagePlugin
 
 from core.errors import NotAnImage, TruncatedImage
+from core.shrink import shrinks_by_area, shrunk_by_area
 
 Pixels = NDArray[np.uint8]
 
@@ -70,6 +71,8 @@ def _fit(picture: Pixels, size: tuple[int, int]) -> Pixels:
         return np.ascontiguousarray(picture)
     # Areas by odd ratios take longer than the decoding itself, and matter only where a picture shrinks much.
     mild = picture.shape[1] < MILD_SHRINK * size[0]
+    if not mild and picture.ndim == 3 and shrinks_by_area(picture, size):
+        return shrunk_by_area(picture, size)
     return np.asarray(
         cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR if mild else cv2.INTER_AREA), np.uint8
     )

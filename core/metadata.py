@@ -9,12 +9,11 @@ import math
 import re
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta, timezone
-from typing import Any
+from typing import Any, Protocol
 
 from core.exif import Tags, number, read_tags, text
 from core.frame import Attitude, FrameMeta, GpsFix
 from core.lenses import LensFacts, focal_length_px
-from core.photo import PhotoHeader
 from core.telemetry import Telemetry, parse_table, parse_telemetry
 
 __all__ = ["parse_table", "parse_telemetry", "read_metadata"]
@@ -70,7 +69,19 @@ _CAMERA_SERIAL_XMP = ("drone-dji:CameraSerialNumber", "Camera:SerialNumber", "au
 _FIRST_YEAR, _LAST_YEAR = 2005, 2100
 
 
-def read_metadata(data: bytes, header: PhotoHeader, telemetry: Mapping[str, Any] | None = None) -> FrameMeta:
+class Size(Protocol):
+    """Whatever knows how many pixels a photo has, as a `PhotoHeader` does."""
+
+    @property
+    def width(self) -> int:
+        """As the sensor wrote them."""
+
+    @property
+    def height(self) -> int:
+        """As the sensor wrote them."""
+
+
+def read_metadata(data: bytes, header: Size, telemetry: Mapping[str, Any] | None = None) -> FrameMeta:
     """The metadata of a photo's bytes; telemetry stands above XMP, XMP above EXIF. Garbage reads as None.
 
     Raises BadTelemetry only, for what `parse_telemetry` would have refused.

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from core.decode import decode_rgb
 from core.errors import PhotoLost, RejectedFrame
 from core.features import FEATURE_SIDE_PX, Features, extract
 from core.frame import FrameMeta
 from core.metadata import read_metadata
-from core.photo import probe
 from services.catalog import frames
 from services.catalog.frames import Attempt
 from services.errors import ObjectNotFound, OutOfDisk
 from services.queue import send
-from workers.app import MAX_ATTEMPTS, Stopwatch, db, go_on, log, settings, stage, store
+from workers.app import MAX_ATTEMPTS, Stopwatch, db, go_on, log, stage, store
 from workers.photos import features_key, photo_key
 
 
@@ -53,7 +51,7 @@ def _read_in(mission_id: str, frame_id: str, attempt: Attempt, clock: Stopwatch)
         _put_off(mission_id, frame_id, attempt.number, PhotoLost())
         return False
     try:
-        meta, features = read(data, attempt.telemetry)
+        meta, features = read(data, attempt)
     except Exception as error:
         _put_off(mission_id, frame_id, attempt.number, error)
         return False
@@ -76,9 +74,9 @@ def _uncounted(mission_id: str, frame_id: str) -> Iterator[None]:
         raise
 
 
-def read(data: bytes, telemetry: Mapping[str, Any] | None) -> tuple[FrameMeta, Features]:
+def read(data: bytes, attempt: Attempt) -> tuple[FrameMeta, Features]:
     """All that is kept of a photo. Raises RejectedFrame."""
-    meta = read_metadata(data, probe(data, settings.photo_limits), telemetry)
+    meta = read_metadata(data, attempt, attempt.telemetry)
     rgb = decode_rgb(data, FEATURE_SIDE_PX)
     return meta, extract(rgb, (meta.width, meta.height))
 

@@ -12,6 +12,7 @@ from core.fusion import FrameIndex
 from core.geometry import Array, Camera, Pose, PosedFrame, World
 from core.matching import MatchCounts, PairMatch
 from core.pyramid import Rgba
+from core.shrink import shrunk_by_area
 
 HEIGHT_M, STEP_M, SIDE_PX = 60.0, 12.0, 256
 NORTH_UP_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -48,6 +49,7 @@ def _meta(k: int) -> FrameMeta:
 def rendering() -> None:
     """Features, rendering, encoding."""
     photos = _Chequered()
+    shrunk_by_area(photos.photo("0"), (SIDE_PX // 2, SIDE_PX * 3 // 8))
     extract(photos.photo("0"), (SIDE_PX, SIDE_PX), FeatureParams())
     frames = [
         PosedFrame(str(k), _camera(), Pose(NORTH_UP_DOWN, _center(k), 0.0), (1.0, 1.01, 1.02))

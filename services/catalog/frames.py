@@ -42,7 +42,7 @@ _BEGIN = (
     update(table(Frame))
     .where(_ONE, _FRAME.state == "received")
     .values(attempts=_FRAME.attempts + 1)
-    .returning(_FRAME.attempts, _FRAME.telemetry)
+    .returning(_FRAME.attempts, _FRAME.width, _FRAME.height, _FRAME.telemetry)
 )
 _ADVANCE = update(table(Frame)).where(_ONE, _FRAME.state == bindparam("before")).returning(_FRAME.id)
 _BEFORE_IT_CAME = select(MISSION.state, MISSION.first_upload_at, MISSION.final_generation).where(
@@ -52,9 +52,11 @@ _BEFORE_IT_CAME = select(MISSION.state, MISSION.first_upload_at, MISSION.final_g
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """At reading a photo: the how manieth it is, and what was sent along with the photo."""
+    """At reading a photo: the how manieth it is, the photo's pixels, and what was sent along with it."""
 
     number: int
+    width: int
+    height: int
     telemetry: Mapping[str, Any] | None
 
 

@@ -183,7 +183,7 @@ class TestStates:
         receive(db, mission_id, "f")
         for expected in (1, 2, 3):
             with db.write() as tx:
-                assert frames.begin(tx, mission_id, "f") == Attempt(expected, None)
+                assert frames.begin(tx, mission_id, "f") == Attempt(expected, 4000, 3000, None)
         advance(db, mission_id, "f", "ready")
         with db.write() as tx:
             assert frames.begin(tx, mission_id, "f") is None
