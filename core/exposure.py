@@ -1,12 +1,15 @@
 """Exposure, white balance and vignetting, balanced over the overlaps of the frames.
 
 Where two photos see the same ground, the logarithms of their light (`core.tone`) may differ only by their
-gains and by their lens's falloff. Robust least squares over ground points, whose brightness is eliminated;
-gains are held near 1, so that the map as a whole gets neither brighter nor darker.
+gains, by their lens's falloff, and by the side that the ground is seen from: it is brightest with the sun
+behind the camera. Left out, that side would add up from photo to photo to a map bright at one end and dark at
+the other. Robust least squares over ground points, whose brightness is eliminated; gains are held near 1, so
+that the map as a whole gets neither brighter nor darker.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -35,7 +38,8 @@ class ExposureParams:
     `side_px`: photos are shrunk to this before their colours are compared; `points_per_side`: ground points
     across a median footprint. `darkest`, `brightest`: grey levels between which a colour is trusted. In
     logarithms: `noise` of one comparison; `outlier` beyond which it fades in the end, `doubt` at first, when
-    nobody's gain is known; the `gain_sigma` around 1 and the `falloff_sigma` around a perfect lens.
+    nobody's gain is known; the `gain_sigma` around 1 and the `falloff_sigma` around a perfect lens and
+    ground that looks the same from all sides.
     """
 
     side_px: int = 32
@@ -45,7 +49,7 @@ class ExposureParams:
     noise: float = 0.25
     outlier: float = 0.3
     doubt: float = 1.0
-    gain_sigma: float = 0.5
+    gain_sigma: float = 0.3
     falloff_sigma: float = 0.3
     iterations: int = 6
 
@@ -56,19 +60,21 @@ DEFAULT = ExposureParams()
 @dataclass(frozen=True, slots=True)
 class _Sightings:
     """Who saw which point in what light. `frame`, `point`: (M,) int64, points ascending; `log`: (M, 3);
-    `rho2`: (M,); `start`: where the sightings of each point begin, (P,).
+    `place`: (M, 3), ρ² of `Camera.falloff` and how far east and north the unit ray goes; `start`: where the
+    sightings of each point begin, (P,).
     """
 
     frame: Index
     point: Index
     log: Array
-    rho2: Array
+    place: Array
     start: Index
 
     @property
-    def powers(self) -> Array:
-        """What a camera's falloff is multiplied with, (M, 3)."""
-        return np.column_stack((self.rho2, self.rho2**2, self.rho2**3))
+    def terms(self) -> Array:
+        """What a channel's numbers in a camera's falloff are multiplied with, (M, 5)."""
+        rho2 = self.place[:, 0]
+        return np.column_stack((rho2, rho2**2, rho2**3, self.place[:, 1:]))
 
     def sums(self, values: Array) -> Array:
         """The sums of (M, …) values over each point's sightings, (P, …)."""
@@ -143,13 +149,13 @@ def _sightings(
     ]
     if not parts:
         nobody = np.zeros(0, np.int64)
-        return _Sightings(nobody, nobody, np.zeros((0, 3)), np.zeros(0), nobody)
-    frame, cells, log, rho2 = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return _Sightings(nobody, nobody, np.zeros((0, 3)), np.zeros((0, 3)), nobody)
+    frame, cells, log, place = (np.concatenate(column) for column in zip(*parts, strict=True))
     _, point, count = np.unique(cells, return_inverse=True, return_counts=True)
     order = np.argsort(point, kind="stable")
     order = order[count[point[order]] > 1]
     first = np.diff(point[order], prepend=-1) > 0
-    return _Sightings(frame[order], np.cumsum(first) - 1, log[order], rho2[order], np.flatnonzero(first))
+    return _Sightings(frame[order], np.cumsum(first) - 1, log[order], place[order], np.flatnonzero(first))
 
 
 def _sighting(
@@ -164,7 +170,7 @@ def _sighting(
     size = (max(2, round(thumb.shape[1] * scale)), max(2, round(thumb.shape[0] * scale)))
     small = np.asarray(cv2.resize(thumb, size, interpolation=cv2.INTER_AREA), np.uint8)
     most = int(np.prod(high - low + 1))
-    cells, colour, rho2 = np.empty(most, np.int64), np.empty((most, 3)), np.empty(most)
+    cells, colour, place = np.empty(most, np.int64), np.empty((most, 3)), np.empty((most, 3))
     found = _sight(
         np.concatenate((low, high)),
         step,
@@ -175,9 +181,9 @@ def _sighting(
         np.array((params.darkest, params.brightest)),
         cells,
         colour,
-        rho2,
+        place,
     )
-    return np.full(found, k), cells[:found], log_light(colour[:found]), rho2[:found]
+    return np.full(found, k), cells[:found], log_light(colour[:found]), place[:found]
 
 
 @compiled
@@ -185,23 +191,23 @@ def _sight(
     box: Index,
     step: float,
     world_R_cam: Array,
-    place: Array,
+    center: Array,
     lens: Array,
     small: Thumb,
     trusted: Array,
     cells: Index,
     colour: Array,
-    rho2: Array,
+    place: Array,
 ) -> int:
-    """How many points of the lattice the picture shows in trusted colours; which, and how.
+    """How many points of the lattice the picture shows in trusted colours; which, how, and where in it.
 
-    `box`: from and to which column and row. `place`: the camera's centre, and the height of the ground.
+    `box`: from and to which column and row. `center`: of the camera, and the height of the ground.
     """
     height, width = small.shape[:2]
     count = 0
     for col in range(box[0], box[2] + 1):
         for row in range(box[1], box[3] + 1):
-            u, v, cos_view = project(col * step, row * step, place[3], world_R_cam, place[:3], lens)
+            u, v, cos_view = project(col * step, row * step, center[3], world_R_cam, center[:3], lens)
             x, y = (u + 0.5) / lens[6] * width - 0.5, (v + 0.5) / lens[7] * height - 0.5
             if cos_view <= 0 or not (0 < x < width - 1 and 0 < y < height - 1):
                 continue
@@ -216,34 +222,46 @@ def _sight(
             if good:
                 cells[count] = (col << 32) + row
                 away = (u - lens[1]) ** 2 + (v - lens[2]) ** 2
-                rho2[count] = 4 * away / (lens[6] * lens[6] + lens[7] * lens[7])
+                place[count, 0] = 4 * away / (lens[6] * lens[6] + lens[7] * lens[7])
+                dx, dy, dz = col * step - center[0], row * step - center[1], center[3] - center[2]
+                away_m = math.sqrt(dx * dx + dy * dy + dz * dz)
+                place[count, 1] = dx / away_m
+                place[count, 2] = dy / away_m
                 count += 1
     return count
 
 
 def _solve(seen: _Sightings, lens: Index, lenses: int, params: ExposureParams) -> tuple[Array, Array]:
-    """Gains (N, 3) and falloffs (C, 9): log light = point − log gain + falloff."""
+    """Gains (N, 3) and falloffs (C, 15): log light = point − log gain + falloff."""
     n, m = len(lens), len(seen.frame)
-    at = n + 3 * lens[seen.frame]
-    cols = np.column_stack((seen.frame, at, at + 1, at + 2))
-    values = np.column_stack((-np.ones(m), seen.powers))
-    rows = np.repeat(np.arange(m), 4)
-    design = sparse.csr_matrix((values.ravel(), (rows, cols.ravel())), shape=(m, n + 3 * lenses))
-    prior = np.full(n + 3 * lenses, params.falloff_sigma**-2)
+    terms = seen.terms
+    wide = terms.shape[1]
+    cols = np.column_stack((seen.frame, n + wide * lens[seen.frame][:, None] + np.arange(wide)))
+    values = np.column_stack((-np.ones(m), terms))
+    rows = np.repeat(np.arange(m), 1 + wide)
+    design = sparse.csr_matrix((values.ravel(), (rows, cols.ravel())), shape=(m, n + wide * lenses))
+    prior = np.full(n + wide * lenses, params.falloff_sigma**-2)
     prior[:n] = params.gain_sigma**-2
     answer = _reweighted(design, seen, prior, params, _sparsely)
-    falloff = answer[n:].reshape(lenses, 3, 3).transpose(0, 2, 1).reshape(lenses, 9)
+    by_channel = answer[n:].reshape(lenses, wide, 3).transpose(0, 2, 1)
+    falloff = [np.concatenate((of[:, :3].ravel(), of[:, 3:].ravel())) for of in by_channel]
     # Rounded, so that a sum's last bits never show in a tile.
     return np.asarray(np.round(np.exp(answer[:n]), 5), float), np.round(falloff, 5)
+
+
+def _by_channel(falloff: tuple[float, ...]) -> Array:
+    """A camera's falloff as what `terms` are multiplied with, (3, 5)."""
+    numbers = np.array([*falloff, *(0.0,) * (15 - len(falloff))])
+    return np.column_stack((numbers[:9].reshape(3, 3), numbers[9:].reshape(3, 2)))
 
 
 def _fit(
     seen: _Sightings, frames: Sequence[PosedFrame], free: NDArray[np.bool_], params: ExposureParams
 ) -> Array:
     """The gains (n, 3) of the n free ones among the frames."""
-    lenses = np.array([f.camera.falloff or (0.0,) * 9 for f in frames]).reshape(-1, 3, 3)
+    lenses = np.array([_by_channel(f.camera.falloff) for f in frames])
     gains = np.array([(1.0, 1.0, 1.0) if new else f.gain for f, new in zip(frames, free, strict=True)])
-    known = np.log(gains)[seen.frame] - np.einsum("mcp,mp->mc", lenses[seen.frame], seen.powers)
+    known = np.log(gains)[seen.frame] - np.einsum("mct,mt->mc", lenses[seen.frame], seen.terms)
     design = -(seen.frame[:, None] == np.flatnonzero(free)).astype(float)
     prior = np.full(design.shape[1], params.gain_sigma**-2)
     even = replace(seen, log=seen.log + known)

@@ -65,7 +65,7 @@ class FusionParams:
     """
 
     bands: int = 4
-    tone_side_px: int = 32
+    tone_side_px: int = 64
     tone_tolerance: float = 12.0
     max_view_deg: float = 75.0
     gnss_importance: float = 0.25

@@ -25,7 +25,8 @@ class Camera:
 
     Pixels are those of the original photo as the sensor wrote it (EXIF orientation ignored). `falloff`: none,
     or nine numbers: the logarithm of the light (`core.tone`) that the lens passes is a ρ² + b ρ⁴ + c ρ⁶ with
-    (a, b, c) for red, then green, then blue; ρ = distance from (cx, cy) over half the picture's diagonal.
+    (a, b, c) for red, then green, then blue; ρ = distance from (cx, cy) over half the picture's diagonal. Six
+    more, (e, n) for each: ground seen along the unit ray (x, y, z) in the world sends e x + n y more of it.
     """
 
     width: int

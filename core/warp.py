@@ -78,7 +78,7 @@ class Views(NamedTuple):
 
     `weight`: int32, 0 where the frame has no say, `INSIDE` … `FULL` inside of its photo. `spot`: (…, 3) int16
     in 1/16 grey levels: how the colours of the smallest things that a knot can tell depart from
-    a much coarser mean. `own`: the photo's local mean colour. `even`: the same without the lens's falloff.
+    a much coarser mean. `own`: the photo's local mean colour. `even`: the same without its camera's falloff.
     `detail`: how `own` departs from that much coarser mean. `sharp`: uint8, `core.sharpness`, 0 = unknown.
     """
 
@@ -148,7 +148,7 @@ def look(
         float(pose.ground_h_m),
         intrinsics(frame.camera),
         *tones,
-        np.array(frame.camera.falloff or (0.0,) * 9),
+        np.array([*frame.camera.falloff, *(0.0,) * (15 - len(frame.camera.falloff))]),
         np.array([importance, min_cos_view, skirt_px, _reach_m(frame, skirt_px)]),
         *(column[k] for column in views),
     )
@@ -330,11 +330,14 @@ def _look(
             continue
         _sample(fine, right, down, value)
         rho2 = 4 * ((u - lens[1]) ** 2 + (v - lens[2]) ** 2) / (width * width + height * height)
+        away_m = math.sqrt((x - center[0]) ** 2 + (y - center[1]) ** 2 + (h_m - center[2]) ** 2)
+        east, north = (x - center[0]) / away_m, (y - center[1]) / away_m
         for c in range(3):
             own[j, i, c] = light[j, i, c] = value[c]
             detail[j, i, c] = value[c] - around[c]
             if not bare:
                 dim = rho2 * (falloff[3 * c] + rho2 * (falloff[3 * c + 1] + rho2 * falloff[3 * c + 2]))
+                dim += falloff[9 + 2 * c] * east + falloff[10 + 2 * c] * north
                 light[j, i, c] = math.floor(16 * lit(value[c] / 16, math.exp(-dim)) + 0.5)
 
 

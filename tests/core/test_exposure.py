@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.exposure import balance, balanced
+from core.exposure import balance, balanced, fitted
 from core.geometry import Camera, Pose, PosedFrame, World
 
 Rgb = NDArray[np.uint8]
@@ -24,8 +24,16 @@ def albedo(xy: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.column_stack((base, base + 12 * np.sin(x / 5), base - 10 * np.cos(y / 6))))
 
 
-def thumb(frame: PosedFrame, gain: NDArray[np.float64], falloff: tuple[float, ...] = ()) -> Rgb:
-    """128 × 96 px of what the camera shows, its light multiplied by `gain` and dimmed by the lens."""
+def thumb(
+    frame: PosedFrame,
+    gain: NDArray[np.float64],
+    falloff: tuple[float, ...] = (),
+    sun: tuple[float, float] = (0.0, 0.0),
+) -> Rgb:
+    """128 × 96 px of what the camera shows, its light multiplied by `gain` and dimmed by the lens.
+
+    `sun`: the logarithm of the light that comes more for each unit that the ray goes east and north.
+    """
     us, vs = np.meshgrid((np.arange(128) + 0.5) * 12.5 - 0.5, (np.arange(96) + 0.5) * 12.5 - 0.5)
     uv = np.column_stack((us.ravel(), vs.ravel()))
     colour = albedo(frame.pose.ground(frame.camera, uv)[:, :2])
@@ -34,7 +42,15 @@ def thumb(frame: PosedFrame, gain: NDArray[np.float64], falloff: tuple[float, ..
         rho2 = 4 * ((uv - (CAMERA.cx, CAMERA.cy)) ** 2).sum(1) / (CAMERA.width**2 + CAMERA.height**2)
         powers = np.column_stack((rho2, rho2**2, rho2**3))
         light *= np.exp(powers @ np.reshape(falloff, (3, 3)).T)
+    ray = frame.pose.ground(frame.camera, uv) - frame.pose.center
+    light *= np.exp((ray / np.linalg.norm(ray, axis=1)[:, None])[:, :2] @ sun)[:, None]
     return np.floor(256 * light / (1 + light)).astype(np.uint8).reshape(96, 128, 3)
+
+
+def turned(yaw_rad: float) -> NDArray[np.float64]:
+    """A turn around the vertical."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def flight(lines: int = 4, per_line: int = 6) -> list[PosedFrame]:
@@ -48,37 +64,45 @@ def flight(lines: int = 4, per_line: int = 6) -> list[PosedFrame]:
     return out
 
 
+def apart(lit: list[PosedFrame], lights: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """How the logarithms (N, 3) of the light in which the same ground is drawn differ from photo to photo.
+
+    All alike may stay brighter or darker: what must go are the differences.
+    """
+    side = np.array([np.reshape(f.camera.falloff[9:], (3, 2)) @ f.pose.center[:2] / 16 for f in lit])
+    left = np.log([np.multiply(f.gain, lights[f.frame_id]) for f in lit]) + side
+    return np.asarray(left - left.mean(0))
+
+
 def test_exposure_steps_are_found() -> None:
     frames, rng = flight(), np.random.default_rng(5)
     dimmed = {f.frame_id: np.exp(rng.normal(0, 0.1, 3)) for f in frames}
-    thumbs = {f.frame_id: thumb(f, dimmed[f.frame_id]) for f in frames}
-    gains = balance(frames, WORLD, thumbs)
-    left = np.array([np.log(gains[f.frame_id] * dimmed[f.frame_id]) for f in frames])
-    given = np.array([np.log(dimmed[f.frame_id]) for f in frames])
-    # All alike may stay brighter or darker: what must go are the differences.
-    assert (left - left.mean(0)).std() < 0.15 * (given - given.mean(0)).std()
-    assert np.abs(left - left.mean(0)).max() < 0.05
+    lit = balanced(frames, WORLD, {f.frame_id: thumb(f, dimmed[f.frame_id]) for f in frames})
+    left = apart(lit, dimmed)
+    assert left.std() < 0.15 * np.log(list(dimmed.values())).std()
+    assert np.abs(left).max() < 0.05
 
 
 def test_a_camera_that_exposes_by_what_it_sees_is_understood() -> None:
     """Half as much light again over a forest as over a meadow beside it, white balance alike."""
     frames, rng = flight(5, 8), np.random.default_rng(15)
     lights = {f.frame_id: np.exp(rng.choice([-0.4, 0.0, 0.4]) + rng.normal(0, 0.1, 3)) for f in frames}
-    thumbs = {f.frame_id: thumb(f, lights[f.frame_id]) for f in frames}
-    gains = balance(frames, WORLD, thumbs)
-    left = np.log([np.multiply(gains[k], lights[k]) for k in sorted(gains)])
-    assert np.abs(left - left.mean(0)).max() < 0.03
+    lit = balanced(frames, WORLD, {f.frame_id: thumb(f, lights[f.frame_id]) for f in frames})
+    assert np.abs(apart(lit, lights)).max() < 0.03
     # anchored: neither brighter nor darker as a whole
-    assert np.log(list(gains.values())).mean(0) == pytest.approx((0, 0, 0), abs=1e-4)
+    assert np.log([f.gain for f in lit]).mean(0) == pytest.approx((0, 0, 0), abs=1e-4)
 
 
 def test_tone_does_not_drift_along_a_line() -> None:
+    """Errors of single photos do not add up; no more of a slope is left than lights by chance have."""
     frames, rng = flight(2, 40), np.random.default_rng(16)
     lights = {f.frame_id: np.exp(rng.normal(0, 0.2, 3)) for f in frames}
-    gains = balance(frames, WORLD, {f.frame_id: thumb(f, lights[f.frame_id]) for f in frames})
-    left = np.log([np.multiply(gains[f.frame_id], lights[f.frame_id]) for f in frames])
-    ends = left[[0, 1, 40, 41]].mean(0) - left[[38, 39, 78, 79]].mean(0)
-    assert np.abs(ends).max() < 0.05
+    lit = balanced(frames, WORLD, {f.frame_id: thumb(f, lights[f.frame_id]) for f in frames})
+    assert np.abs(apart(lit, lights)).max() < 0.04
+    left = np.log([np.multiply(f.gain, lights[f.frame_id]) for f in lit])
+    along = np.array([f.pose.center[0] for f in lit])
+    ends = np.polyfit(along, left, 1)[0] * np.ptp(along)
+    assert np.abs(ends).max() < 3 * 0.2 * np.sqrt(12 / len(frames))
 
 
 def test_the_falloff_of_the_lens_is_found() -> None:
@@ -88,9 +112,23 @@ def test_the_falloff_of_the_lens_is_found() -> None:
     assert len({f.camera for f in lit}) == 1
     rho2 = np.linspace(0, 0.9, 10)
     powers = np.column_stack((rho2, rho2**2, rho2**3))
-    found = powers @ np.reshape(lit[0].camera.falloff, (3, 3)).T
+    found = powers @ np.reshape(lit[0].camera.falloff[:9], (3, 3)).T
     assert np.abs(found - powers @ np.reshape(FALLOFF, (3, 3)).T).max() < 0.03
     assert np.abs(np.array([f.gain for f in lit]) - 1).max() < 0.03
+
+
+def test_the_side_that_the_sun_lights_makes_no_map_with_a_dark_end() -> None:
+    """Every photo is brighter in its north: matched edge to edge the map would get darker northwards."""
+    frames = [
+        replace(f, pose=replace(f.pose, world_R_cam=turned(k % 2 * np.pi) @ DOWN))
+        for k, f in enumerate(flight(12, 5))
+    ]
+    sun = (-0.2, 0.5)
+    lit = balanced(frames, WORLD, {f.frame_id: thumb(f, np.ones(3), FALLOFF, sun) for f in frames})
+    assert np.reshape(lit[0].camera.falloff[9:], (3, 2)) == pytest.approx(np.tile(sun, (3, 1)), abs=0.05)
+    north = np.array([f.pose.center[1] for f in lit])
+    slope = np.polyfit(north - north.mean(), np.log([f.gain for f in lit]).mean(1), 1)[0]
+    assert abs(slope) * np.ptp(north) < 0.05
 
 
 def test_a_perfect_camera_is_left_alone() -> None:
@@ -98,7 +136,7 @@ def test_a_perfect_camera_is_left_alone() -> None:
     thumbs = {f.frame_id: thumb(f, np.ones(3)) for f in frames}
     for frame in balanced(frames, WORLD, thumbs):
         assert frame.gain == pytest.approx((1, 1, 1), abs=0.005)
-        assert frame.camera.falloff == pytest.approx((0,) * 9, abs=0.02)
+        assert frame.camera.falloff == pytest.approx((0,) * 15, abs=0.02)
 
 
 def test_what_one_frame_sees_alone_misleads_nobody() -> None:
@@ -130,7 +168,7 @@ def test_two_cameras_have_two_lenses() -> None:
     mixed = [replace(f, camera=other) if k % 2 else f for k, f in enumerate(frames)]
     thumbs = {f.frame_id: thumb(f, np.ones(3), FALLOFF if f.camera == other else ()) for f in mixed}
     for frame in balanced(mixed, WORLD, thumbs):
-        corner = np.exp(np.reshape(frame.camera.falloff, (3, 3)).sum(1))
+        corner = np.exp(np.reshape(frame.camera.falloff[:9], (3, 3)).sum(1))
         expected = np.exp(np.reshape(FALLOFF, (3, 3)).sum(1)) if frame.camera.f_px > 1505 else np.ones(3)
         assert corner == pytest.approx(expected, abs=0.08)
 
@@ -156,3 +194,29 @@ def test_flat_rays_do_not_blow_up() -> None:
     thumbs = {f.frame_id: np.full((96, 128, 3), 100, np.uint8) for f in frames}
     gains = balance(frames, WORLD, thumbs)
     assert np.isfinite(np.array(list(gains.values()))).all()
+
+
+def test_new_photos_suit_those_that_are_there() -> None:
+    """Against the truth, not against another balance; and nothing about the known ones changes."""
+    frames, rng = flight(), np.random.default_rng(7)
+    lights = {f.frame_id: np.exp(rng.normal(0, 0.3, 3)) for f in frames}
+    thumbs = {f.frame_id: thumb(f, lights[f.frame_id], FALLOFF, (0.1, 0.3)) for f in frames}
+    lens = replace(CAMERA, falloff=(*FALLOFF, *(0.1, 0.3) * 3))
+    even = [replace(f, camera=lens, gain=tuple(1 / lights[f.frame_id])) for f in frames]
+    new, known = even[8:11], [*even[:8], *even[11:]]
+    blank = [replace(f, gain=(1.0, 1.0, 1.0)) for f in new]
+    found = fitted(blank, known, thumbs)
+    assert [f.frame_id for f in found] == sorted(f.frame_id for f in new)
+    for frame in found:
+        assert np.log(np.multiply(frame.gain, lights[frame.frame_id])) == pytest.approx((0,) * 3, abs=0.02)
+        assert frame.camera == lens
+    shuffled = [known[k] for k in rng.permutation(len(known))]
+    assert [f.gain for f in fitted(blank[::-1], shuffled, thumbs)] == [f.gain for f in found]
+
+
+def test_a_new_photo_that_overlaps_nobody_keeps_its_light() -> None:
+    near, far = flight(1, 1)[0], flight(1, 1)[0]
+    far = replace(far, frame_id="far", pose=replace(far.pose, center=far.pose.center + 500.0))
+    thumbs = {f.frame_id: thumb(f, np.full(3, 0.7)) for f in (near, far)}
+    assert fitted([far], [near], thumbs)[0].gain == (1.0, 1.0, 1.0)
+    assert fitted([far], [], thumbs)[0].gain == (1.0, 1.0, 1.0)

@@ -312,6 +312,24 @@ def test_falloff_of_the_lens_is_lifted() -> None:
     assert render(grid, WORLD, plain, album)[..., 0][drawn[..., 3] > 0].min() < 150
 
 
+def test_the_side_that_the_sun_lights_is_evened_out() -> None:
+    """Photos whose east is brighter, the ray's length and all, show an even ground."""
+    sun = (0.0,) * 9 + (0.6, 0.0) * 3
+    camera = Camera(360, 270, 760.0, 179.5, 134.5, falloff=sun)
+    ys, xs = np.mgrid[0:270, 0:360]
+    east = (xs - 179.5) / np.sqrt((xs - 179.5) ** 2 + (ys - 134.5) ** 2 + 760.0**2)
+    light = 100 / 156 * np.exp(0.6 * east)
+    photo = np.repeat((256 * light / (1 + light))[..., None], 3, axis=2).astype(np.uint8)
+    frames, album = two_frames(photo, photo)
+    grid = middle(520, 240)
+    drawn = render(grid, WORLD, [replace(f, camera=camera) for f in frames], album)
+    shown = drawn[drawn[..., 3] > 0][:, :3].astype(int)
+    assert np.abs(shown - 100).mean() < 1
+    assert np.abs(shown - 100).max() <= 3
+    plain = render(grid, WORLD, frames, album)
+    assert np.ptp(plain[plain[..., 3] > 0][:, 0].astype(int)) > 12
+
+
 def test_what_only_one_photo_sees_leaves_no_ghost_in_the_other() -> None:
     """A black thing in the loser's picture does not darken the winner's; a plain average would."""
     clear = np.full((270, 360, 3), 150, np.uint8)
