@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 
 from services.catalog.pairs import Key as PairKey
 from services.catalog.tiles import Key
 
 FEWEST_PAIRS, MOST_PAIRS = 6, 24
-SHORTEST, LONGEST = 4, 48
+SHORTEST, LONGEST = 4, 64
 AHEAD_TILES = 96
 """So many tiles a worker are handed out at most: enough that none waits for the next ones."""
 
@@ -22,7 +23,7 @@ def runs(tiles: Iterable[Key], to_render: int, workers: int) -> list[list[Key]]:
     found: list[list[Key]] = []
     run: list[Key] = []
     for tile in tiles:
-        size = _size(to_render, workers, SHORTEST, LONGEST)
+        size = _size(to_render, 1.2 * workers, SHORTEST, LONGEST)
         if len(run) >= size and _block(run[-1]) != _block(tile):
             found.append(run)
             to_render, run = to_render - len(run), []
@@ -34,13 +35,13 @@ def tasks(pairs: Sequence[PairKey], workers: int) -> Iterator[Sequence[PairKey]]
     """Pairs to match in their order, for one task after the other."""
     start = 0
     while start < len(pairs):
-        size = _size(len(pairs) - start, workers, FEWEST_PAIRS, MOST_PAIRS)
+        size = _size(len(pairs) - start, 2 * workers, FEWEST_PAIRS, MOST_PAIRS)
         yield pairs[start : start + size]
         start += size
 
 
-def _size(left: int, workers: int, least: int, most: int) -> int:
-    return min(max(-(-left // (2 * workers)), least), most)
+def _size(left: int, shares: float, least: int, most: int) -> int:
+    return min(max(math.ceil(left / shares), least), most)
 
 
 def _block(tile: Key) -> Key:
