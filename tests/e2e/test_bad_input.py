@@ -146,19 +146,29 @@ def results(out: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return json.loads((out / "report.json").read_text()), {f["name"]: f for f in poses["frames"]}
 
 
-def test_one_card_with_everything_on_it(
-    flight: list[Path], elsewhere: list[Path], server: str, tmp_path: Path
-) -> None:
-    card = tmp_path / "card [bold] № 1"
-    card.mkdir()
+REFUSED = {
+    "text.jpg": "not_an_image",
+    "empty [red].jpg": "empty_file",
+    "torn.jpg": "truncated_image",
+    "stump.jpg": "truncated_image",
+    "bomb.jpg": "too_many_pixels",
+    "bomb.tif": "too_many_pixels",
+    "thumb.jpg": "too_few_pixels",
+    "huge.jpg": "file_too_large",
+    "sydney.jpg": "far_from_mission",
+}
+
+
+def odd_photos(flight: list[Path], card: Path) -> set[str]:
+    """Puts the flight onto the card, most of its photos changed; the names of those that can be mapped."""
     for path in flight:
         shutil.copy(path, card)
     at = {k: card / path.name for k, path in enumerate(flight)}
-    # What can be mapped all the same:
     at[1].write_bytes(retagged(flight[1], gps=None))
     at[2].write_bytes(retagged(flight[2], gps=GpsFix(0.0, 0.0, 0.0), xmp=False))
     at[3].write_bytes(retagged(flight[3], captured_s=0.0))
     at[4].write_bytes(retagged(flight[4], captured_s=4.0e9))
+    at[5].write_bytes(retagged(flight[5], attitude=lambda a: replace(a, pitch_rad=0.0)))
     at[6].write_bytes(resaved(flight[6], "JPEG", "L"))
     at[7].write_bytes(resaved(flight[7], "JPEG", orientation=6))
     at[10].write_bytes(retagged(flight[10], half_size(flight[10]), f_px=lambda f: f / 2, serial="B"))
@@ -167,11 +177,15 @@ def test_one_card_with_everything_on_it(
     (card / "DCIM").mkdir()
     at[9].rename(card / "DCIM" / at[10].name)  # two folders, one name
     os.rename(at[11], os.fsencode(card) + b"/bad\xff[b]name.jpg")
-    # What cannot:
-    at[5].write_bytes(retagged(flight[5], attitude=lambda a: replace(a, pitch_rad=0.0)))
+    as_they_are = {p.name for p in flight} - {flight[k].name for k in (5, 8, 9, 11)}
+    return as_they_are | {at[8].with_suffix(".tif").name, "bad�[b]name.jpg", f"DCIM_{flight[10].name}"}
+
+
+def no_photos(flight: list[Path], elsewhere: list[Path], card: Path) -> None:
+    """Puts onto the card what cannot be mapped, and what is there already."""
+    whole = flight[0].read_bytes()
     (card / "text.jpg").write_text("no photo")
     (card / "empty [red].jpg").write_bytes(b"")
-    whole = flight[0].read_bytes()
     (card / "torn.jpg").write_bytes(whole[: len(whole) // 2])
     (card / "stump.jpg").write_bytes(whole[:300])
     (card / "bomb.jpg").write_bytes(jpeg_header(20_000, 20_000))
@@ -186,32 +200,23 @@ def test_one_card_with_everything_on_it(
     (card / "gone.jpg").symlink_to("nowhere")
     Image.new("RGB", (640, 480)).save(card / "screen.png")
 
-    out = tmp_path / "out"
+
+def test_one_card_with_everything_on_it(
+    flight: list[Path], elsewhere: list[Path], server: str, tmp_path: Path
+) -> None:
+    card, out = tmp_path / "card [bold] № 1", tmp_path / "out"
+    card.mkdir()
+    names = odd_photos(flight, card)
+    no_photos(flight, elsewhere, card)
     done = orthostream("run", card, "--out", out, "--server", server)
     assert done.returncode == 0, done.stdout + done.stderr
     report, placed = results(out)
-    assert {r["name"]: r["code"] for r in report["rejected"]} == {
-        flight[5].name: "oblique",
-        "text.jpg": "not_an_image",
-        "empty [red].jpg": "empty_file",
-        "torn.jpg": "truncated_image",
-        "stump.jpg": "truncated_image",
-        "bomb.jpg": "too_many_pixels",
-        "bomb.tif": "too_many_pixels",
-        "thumb.jpg": "too_few_pixels",
-        "huge.jpg": "file_too_large",
-        "sydney.jpg": "far_from_mission",
-    }
+    assert {r["name"]: r["code"] for r in report["rejected"]} == REFUSED | {flight[5].name: "oblique"}
     assert [w["name"] for w in report["waiting"]] == ["stranger.jpg"]
     for rejected in report["rejected"]:
         assert f"rejected {rejected['name']}: {rejected['reason']}" in done.stdout
         # why, and what to do: two sentences
         assert re.match(r".{20,}\. [A-Z].{10,}\.$", rejected["reason"]), rejected["reason"]
-    names = {p.name for p in flight} - {flight[k].name for k in (5, 8, 9, 10, 11)}
-    names |= {at[8].with_suffix(".tif").name, "bad�[b]name.jpg"} | {
-        flight[10].name,
-        f"DCIM_{flight[10].name}",
-    }
     assert placed.keys() == names
     assert {f["source"] for f in placed.values()} == {"visual"}
     assert "copy.jpg (= " in done.stdout or "(= copy.jpg)" in done.stdout

@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 from sqlalchemy import text
 
-from services.catalog import missions
+from core.frame import FrameMeta
+from services.catalog import frames, leases, missions
 from services.database import Database
 
 
@@ -125,3 +126,22 @@ def race() -> Callable[[int, Callable[[int], Any]], list[Any]]:
         return [result for _, result in answers]
 
     return run
+
+
+@pytest.fixture
+def owner(db: Database, mission_id: str) -> int:
+    with db.write() as tx:
+        epoch = leases.acquire(tx, mission_id, "me", 3600.0)
+    assert epoch is not None
+    return epoch
+
+
+@pytest.fixture
+def matched(db: Database, mission_id: str) -> list[str]:
+    ids = ["f0", "f1", "f2"]
+    with db.write() as tx:
+        for frame_id in ids:
+            frames.receive(tx, mission_id, frame_id, frame_id, 1, "image/jpeg", 4000, 3000, now=1.0)
+            frames.mark_ready(tx, mission_id, frame_id, FrameMeta(4000, 3000), 1.0)
+            frames.mark_matched(tx, mission_id, frame_id, 1.0)
+    return ids
