@@ -11,8 +11,10 @@ from PIL import Image
 
 from core.errors import TruncatedImage
 from core.mosaic import Mosaic, build, frame_id_of
+from core.simulation import FlightParams
 from services.catalog import backlog, exports, frames, leases, missions, pairs, poses, tiles
 from services.errors import LeaseLost, OutOfDisk
+from workers.simulate import simulate
 
 Tiles = dict[tuple[int, int, int], bytes]
 
@@ -47,6 +49,37 @@ def test_shuffled_and_repeated_tasks_end_in_the_oracles_tiles(
     bench.drain(chance, times)
     assert bench.state == "final"
     assert set(bench.frame_states().values()) == {"fused"}
+    assert bench.tiles() == expected
+
+
+@pytest.fixture(scope="module")
+def two_drones(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[tuple[str, bytes]], Tiles]:
+    """Five photos of each of two drones, in turns, and the oracle's tiles."""
+    out = tmp_path_factory.mktemp("drones")
+    params = FlightParams(drones=2, lines=1, per_line=5, width_px=480, height_px=360, seed=8)
+    simulate(params, out, jobs=2, truth=False)
+    found = [(p.name, p.read_bytes()) for p in sorted(out.glob("images/*"))]
+    photos = [photo for pair in zip(found[:5], found[5:], strict=True) for photo in pair]
+    return photos, {tuple(k): v for k, v in build(photos).tiles.items()}  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_drones_in_turns_and_an_end_that_comes_early_give_the_oracles_tiles(
+    bench: Any, two_drones: tuple[list[tuple[str, bytes]], Tiles], seed: int
+) -> None:
+    """Photos come while tasks of all kinds are under way, and so does the wish to finish."""
+    (photos, expected), chance = two_drones, random.Random(seed)
+    left = photos if seed % 2 else photos[::-1]
+    while left:
+        count = chance.randint(1, 4)
+        bench.upload(left[:count])
+        left = left[count:]
+        for _ in range(min(chance.randrange(3 * count), len(bench.queue))):
+            name, args = bench.queue.pop(chance.randrange(len(bench.queue)))
+            bench.handle(name, *args)
+    bench.finalise()
+    bench.drain(chance)
+    assert bench.state == "final"
     assert bench.tiles() == expected
 
 
