@@ -66,7 +66,8 @@ def _worth_it(rendered: int, more: int, final: bool) -> bool:
     """
     if not final:
         return rendered >= ENOUGH_LIVE
-    return rendered >= ENOUGH or (more <= LAST_TILES * settings.workers and rendered >= 2 * more)
+    few = LAST_TILES * settings.workers
+    return rendered >= ENOUGH or (more <= few and rendered >= 2 * few)
 
 
 @contextmanager

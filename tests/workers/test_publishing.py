@@ -55,12 +55,13 @@ def test_an_overview_made_with_other_siblings_than_are_shown_is_made_again(
     assert bench.tiles() == expected
 
 
-def test_the_last_revision_is_a_small_one(bench: Any) -> None:
+def test_the_last_revision_is_a_small_one(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever has drawn the last tile waits for its overviews: those of the others are made before."""
     publish, workers = bench.modules["publish"], bench.modules["app"].settings.workers
-    tail = publish.LAST_TILES * workers
-    assert not publish._worth_it(publish.ENOUGH - 1, 10 * publish.ENOUGH, final=True)
-    assert publish._worth_it(publish.ENOUGH, 10 * publish.ENOUGH, final=True)
-    assert publish._worth_it(2 * tail, tail, final=True)
-    assert not publish._worth_it(2 * tail, tail + 1, final=True) or 2 * tail >= publish.ENOUGH
-    assert not publish._worth_it(tail, tail, final=True) or tail >= publish.ENOUGH
+    monkeypatch.setattr(publish, "ENOUGH", 1000 * workers)
+    few = publish.LAST_TILES * workers
+    assert not publish._worth_it(publish.ENOUGH - 1, 10 * few, final=True)
+    assert publish._worth_it(publish.ENOUGH, 10 * few, final=True)
+    assert publish._worth_it(2 * few, few, final=True)
+    assert not publish._worth_it(2 * few, few + 1, final=True)
+    assert not publish._worth_it(few, 1, final=True)  # the last one may as well show these too
