@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from io import SEEK_END, BytesIO
+from io import SEEK_CUR, SEEK_END, BytesIO
 from typing import BinaryIO
 
 from PIL import JpegImagePlugin, TiffImagePlugin
@@ -13,6 +13,8 @@ from core.errors import EmptyFile, FileTooLarge, NotAnImage, TooFewPixels, TooMa
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257
 _JPEG_MAGIC = b"\xff\xd8\xff"
 _TIFF_MAGICS = (b"II*\x00", b"MM\x00*")
+_FRAMES, _SCAN = (0xC0, 0xC1, 0xC2), 0xDA  # JPEG: where the size stands, and where the picture begins
+_SKIPPED = (0xC4, 0xDB, 0xDD, *range(0xE0, 0xF0), 0xFE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +74,36 @@ def _header(photo: BinaryIO, size_bytes: int) -> PhotoHeader:
 
 
 def _jpeg_size(photo: BinaryIO) -> tuple[int, int]:
+    size = _orderly_size(photo)
+    if size is not None:
+        return size
+    photo.seek(0)
     # The plugin itself, not Image.open: that one warns or raises by a process-wide pixel limit of its own.
     try:
         width, height = JpegImagePlugin.JpegImageFile(photo).size
     except Exception as error:  # Pillow's plugins raise whatever struct, int and zip do on torn headers
         raise TruncatedImage from error
     return width, height
+
+
+def _orderly_size(photo: BinaryIO) -> tuple[int, int] | None:
+    """Of a JPEG whose segments are in order up to where its picture begins; None: Pillow has to judge it."""
+    size = None
+    photo.seek(2)
+    while len(head := photo.read(4)) == 4 and head[0] == 0xFF:
+        marker, length = head[1], int.from_bytes(head[2:], "big") - 2
+        if marker == _SCAN:
+            return size
+        if marker in _FRAMES:
+            frame = photo.read(length)
+            if len(frame) < 6 or frame[0] != 8 or frame[5] not in (1, 3, 4):
+                return None
+            size = int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
+        elif marker in _SKIPPED and length >= 0:
+            photo.seek(length, SEEK_CUR)
+        else:
+            return None
+    return None
 
 
 def _tiff_size(photo: BinaryIO, start: bytes, size_bytes: int) -> tuple[int, int]:

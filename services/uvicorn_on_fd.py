@@ -6,10 +6,18 @@ started again callers wait in the parent's socket instead of being refused.
 
 from __future__ import annotations
 
+import gc
 import socket
 import sys
 
 import uvicorn
+
+
+class _Server(uvicorn.Server):
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        gc.collect()
+        gc.freeze()  # every route and table: a collector would go through them time and again for nothing
 
 
 def main() -> None:
@@ -22,7 +30,7 @@ def main() -> None:
         log_level="warning",
         timeout_graceful_shutdown=2,
     )
-    uvicorn.Server(config).run(sockets=[listener])
+    _Server(config).run(sockets=[listener])
 
 
 if __name__ == "__main__":

@@ -44,6 +44,9 @@ _BEGIN = (
     .values(attempts=_FRAME.attempts + 1)
     .returning(_FRAME.attempts, _FRAME.width, _FRAME.height, _FRAME.telemetry)
 )
+_FUSED = select(_FRAME.fused_at, _FRAME.received_at).where(
+    _FRAME.mission_id == bindparam("mission"), _FRAME.fused_at.is_not(None)
+)
 _ADVANCE = update(table(Frame)).where(_ONE, _FRAME.state == bindparam("before")).returning(_FRAME.id)
 _BEFORE_IT_CAME = select(MISSION.state, MISSION.first_upload_at, MISSION.final_generation).where(
     MISSION.id == bindparam("mission")
@@ -331,10 +334,7 @@ def sightings(tx: Session, mission_id: str, known: Mapping[str, Seen] | None = N
 
 def latencies_s(tx: Session, mission_id: str) -> Sequence[float]:
     """Seconds from upload to visible tile of every fused frame, in no order."""
-    query = select(Frame.fused_at, Frame.received_at).where(
-        Frame.mission_id == mission_id, Frame.fused_at.is_not(None)
-    )
-    return [fused - received for fused, received in tx.execute(query) if fused is not None]
+    return [fused - received for fused, received in tx.execute(_FUSED, {"mission": mission_id})]
 
 
 def quiet_s(tx: Session, mission_id: str, now: float | None = None) -> float:

@@ -25,6 +25,14 @@ _UNDER_WAY = ("open", *_ENDING)
 _STATE = select(MISSION.state).where(MISSION.id == bindparam("mission"))
 _SPENT = select(MISSION.stage_seconds).where(MISSION.id == bindparam("mission"))
 _PIXELS = select(MISSION.pixels).where(MISSION.id == bindparam("mission"))
+_FRAME, _TILE = table(Frame).c, table(Tile).c
+_BY_STATE = (
+    select(_FRAME.state, func.count()).where(_FRAME.mission_id == bindparam("mission")).group_by(_FRAME.state)
+)
+_FUSED = select(func.count()).where(
+    _FRAME.mission_id == bindparam("mission"), _FRAME.fused_at > bindparam("since")
+)
+_SHOWN = select(func.count()).where(_TILE.mission_id == bindparam("mission"), _TILE.object_key.is_not(None))
 _CHANGE = update(table(Mission)).where(MISSION.id == bindparam("mission"))
 
 
@@ -216,13 +224,10 @@ def count_pixels(tx: Session, mission_id: str, pixels: Mapping[str, int]) -> Non
 def progress(tx: Session, mission_id: str, now: float | None = None) -> Progress:
     """How far the mission has come; raises MissionNotFound."""
     row = mission(tx, mission_id)
-    by_state = select(Frame.state, func.count()).where(Frame.mission_id == mission_id).group_by(Frame.state)
     counts = dict.fromkeys(frames.STATES, 0)
-    for state, count in tx.execute(by_state):
+    for state, count in tx.execute(_BY_STATE, {"mission": mission_id}):
         counts[state] = count
-    window = Frame.fused_at > clock(now) - _RATE_WINDOW_S
-    fused = select(func.count()).select_from(Frame).where(Frame.mission_id == mission_id, window)
-    shown = select(func.count()).where(Tile.mission_id == mission_id, Tile.object_key.is_not(None))
+    since = {"mission": mission_id, "since": clock(now) - _RATE_WINDOW_S}
     return Progress(
         mission_id=mission_id,
         state=row.state,
@@ -230,9 +235,9 @@ def progress(tx: Session, mission_id: str, now: float | None = None) -> Progress
         counts=counts,
         revision=row.revision,
         generation=row.generation,
-        tiles=tx.scalar(shown) or 0,
+        tiles=tx.execute(_SHOWN, {"mission": mission_id}).scalar_one(),
         dirty=tiles.dirty_count(tx, mission_id),
-        fused_per_s=(tx.scalar(fused) or 0) / _RATE_WINDOW_S,
+        fused_per_s=tx.execute(_FUSED, since).scalar_one() / _RATE_WINDOW_S,
         event_seq=row.event_seq,
         first_upload_at=row.first_upload_at,
         last_tile_at=row.last_tile_at,

@@ -37,6 +37,8 @@ NEW, GROWN, HEAL = 0, 1, 5
 """Priorities of dirty tiles: where nothing was shown yet, where ground was added, where poses moved. Before
 the mission is solved finally, those before HEAL are only drawn where they show nothing."""
 
+_DIRTY = select(func.count()).where(table(DirtyTile).c.mission_id == bindparam("mission"))
+
 
 @dataclass(frozen=True, slots=True)
 class Above:
@@ -329,8 +331,8 @@ def bounds(tx: Session, mission_id: str) -> TileBox | None:
 
 def dirty_count(tx: Session, mission_id: str) -> int:
     """How many native tiles do not show the newest poses yet, rendered ones included."""
-    query = select(func.count()).select_from(DirtyTile).where(DirtyTile.mission_id == mission_id)
-    return tx.scalar(query) or 0
+    count: int = tx.execute(_DIRTY, {"mission": mission_id}).scalar_one()
+    return count
 
 
 def _block() -> tuple[Any, Any, Any]:
