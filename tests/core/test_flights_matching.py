@@ -21,6 +21,8 @@ from tests.flights.landmarks import LandmarkParams, features
 LOW, HIGH = "0" * 32, "f" * 32
 PLAN = FlightParams(frames=6, drones=1, lines=1, forward_overlap=0.6, seed=3)
 EVERYTHING = MatchParams(max_final=10_000)
+AT_ONCE = replace(EVERYTHING, strongest=10_000)
+"""Without a first look at the strongest keypoints."""
 SEEDS = (3, 4, 5)
 
 
@@ -85,7 +87,7 @@ def test_the_vote_finds_any_turn_and_keeps_the_share_that_tells_it(turn_deg: flo
     share = 0.2  # of the keypoints' turns mean nothing, so (1 − 0.2)² of the matches tell the truth
     c = (
         couple(replace(PLAN, width_px=900, height_px=900), LandmarkParams(900, odd_turns=share), turn_deg)
-        .match()
+        .match(AT_ONCE)
         .counts
     )
     honest = (1 - share) ** 2
@@ -95,7 +97,7 @@ def test_the_vote_finds_any_turn_and_keeps_the_share_that_tells_it(turn_deg: flo
 
 
 def test_turns_that_mean_nothing_agree_by_chance_only() -> None:
-    c = couple(PLAN, LandmarkParams(800, odd_turns=1.0)).match().counts
+    c = couple(PLAN, LandmarkParams(800, odd_turns=1.0)).match(AT_ONCE).counts
     assert c.tentative > 150
     assert c.voted / c.tentative == pytest.approx(4 / 36, abs=0.07)
 
@@ -104,6 +106,34 @@ def test_what_the_vote_drops_guided_matching_brings_back() -> None:
     c = couple(PLAN, LandmarkParams(odd_turns=0.3)).match().counts
     assert c.voted < 0.7 * c.tentative
     assert c.guided > 1.3 * c.voted
+
+
+# ---- the first look
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("relief_m", [0.0, 8.0])
+def test_looking_at_the_strongest_first_finds_what_looking_at_all_at_once_does(
+    relief_m: float, seed: int
+) -> None:
+    c = couple(replace(PLAN, relief_m=relief_m, seed=seed), LandmarkParams(1000))
+    first, all_at_once = c.match(), c.match(AT_ONCE)
+    assert first.accepted
+    assert all_at_once.accepted
+    assert first.counts.tentative < 0.6 * all_at_once.counts.tentative
+    found, expected = (
+        {(*p, *q) for p, q in zip(m.uv_low.tolist(), m.uv_high.tolist(), strict=True)}
+        for m in (first, all_at_once)
+    )
+    assert len(found & expected) > 0.9 * max(len(found), len(expected))
+    assert np.percentile(c.off_line_px(first), 97) < 2.0 * PLAN.width_px / 640 + 2 * 0.7
+
+
+def test_what_the_strongest_do_not_tell_all_may() -> None:
+    c = couple(replace(PLAN, forward_overlap=0.25), LandmarkParams(1000))
+    few = c.match(replace(EVERYTHING, strongest=60))
+    assert few.accepted
+    assert few.counts == c.match(AT_ONCE).counts
 
 
 # ---- the cross check
