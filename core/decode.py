@@ -53,6 +53,17 @@ def decode_rgb(data: bytes, max_side: int | None = None) -> Pixels:
     return _fit(picture, scaled_size(picture.shape[1], picture.shape[0], max_side))
 
 
+def decode_to_draw(data: bytes, max_side: int | None = None) -> Pixels:
+    """As `decode_rgb`, but up to `MILD_SHRINK` times as large.
+
+    Whoever samples a photo anyway need not have it sampled before.
+    """
+    if not data.startswith(_JPEG_MAGIC):
+        return decode_rgb(data, max_side)
+    picture, size = _decode_jpeg(data, max_side, "RGB"), _jpeg_target(data, max_side)
+    return picture if picture.shape[1] < MILD_SHRINK * size[0] else _fit(picture, size)
+
+
 def decode_gray(data: bytes, max_side: int | None = None) -> Pixels:
     """JPEG or TIFF bytes → (H, W) uint8 luma of `scaled_size`, EXIF orientation ignored.
 

@@ -8,9 +8,10 @@ apart are equal, to the last bit, to the same tiles cut from one large block.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -23,33 +24,23 @@ from core.blend import (
     Tones,
     blend_finest,
     blend_level,
-    gaussian_levels,
     label_level,
     retone,
 )
 from core.geometry import Array, PosedFrame, World
 from core.grid import Grid
+from core.layers import Canvas
+from core.parts import Photos as Photos
+from core.parts import Share, likely
 from core.seams import REACH_CELLS, settle
 from core.sharpness import give_way
 from core.tone import relit
-from core.warp import Int32, Lattice, Rgb, Views, knots, look, warp
+from core.warp import Int32, Lattice, Rgb, Views, look
 
 PAD_CELLS = 2
 """The pyramid looks this many cells beyond a pixel, however many bands there are."""
 SKIRT_CELLS = 2
 """So far beyond a photo's edge its colour still counts a little, lest tone jump at the mosaic's border."""
-
-
-class Photos(Protocol):
-    """Where pixels come from; both must return the same pixels whenever they are asked."""
-
-    def photo(self, frame_id: str) -> Rgb:
-        """The photo at the mission's resolution, (h, w, 3) uint8 RGB, C-contiguous."""
-        ...
-
-    def thumb(self, frame_id: str) -> Rgb:
-        """The whole photo at about 128 px, (h, w, 3) uint8 RGB, or (h, w, 4) with its `core.sharpness`."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +70,11 @@ class FusionParams:
         return 1 << self.bands
 
     @property
+    def min_cos_view(self) -> float:
+        """The cosine of the angle between a ray that is just drawn and the vertical."""
+        return math.cos(math.radians(self.max_view_deg))
+
+    @property
     def rim_cells(self) -> int:
         """So many cells more are looked at, to know where seams run."""
         return REACH_CELLS + 2 if self.seams else 0
@@ -106,6 +102,19 @@ class FrameIndex:
         self._boxes = np.array(boxes, float).reshape(-1, 5)
         self._reach_px = params.reach_px
 
+    def __getitem__(self, frame_id: str) -> PosedFrame:
+        return self.frames[self._place(frame_id)]
+
+    def _place(self, frame_id: str) -> int:
+        return bisect_left(self.frames, frame_id, key=lambda f: f.frame_id)
+
+    def rivals(self, frame: PosedFrame) -> list[PosedFrame]:
+        """The other frames that may show some of the ground that this one shows."""
+        k = self._place(frame.frame_id)
+        west, south, east, north = self._boxes[k, :4]
+        hit = (self._boxes[:, :2] <= (east, north)).all(1) & (self._boxes[:, 2:4] >= (west, south)).all(1)
+        return [self.frames[n] for n in np.flatnonzero(hit) if n != k]
+
     def overlapping(self, grid: Grid, world: World) -> list[PosedFrame]:
         """The frames that may change a pixel of the grid, by ascending id."""
         if not self.frames:
@@ -119,6 +128,25 @@ class FrameIndex:
         low, high = ends.min(0) - margin, ends.max(0) + margin
         hit = (self._boxes[:, :2] <= high).all(1) & (self._boxes[:, 2:4] >= low).all(1)
         return [self.frames[k] for k in np.flatnonzero(hit)]
+
+
+class Territory:
+    """Which part of each frame of an index a map of this resolution will probably show."""
+
+    def __init__(self, frames: FrameIndex, resolution_m: float, params: FusionParams = DEFAULT) -> None:
+        self._frames, self._resolution_m, self._params = frames, resolution_m, params
+        self._found: dict[str, Share] = {}
+
+    def share(self, frame_id: str) -> Share:
+        """Of a frame, worked out when it is first asked for."""
+        if frame_id not in self._found:
+            frame = self._frames[frame_id]
+            rivals = [(f, self._importance(f)) for f in self._frames.rivals(frame)]
+            self._found[frame_id] = likely(frame, self._importance(frame), rivals)
+        return self._found[frame_id]
+
+    def _importance(self, frame: PosedFrame) -> float:
+        return _importance(frame, self._resolution_m, self._params)
 
 
 def overlapping(
@@ -205,6 +233,17 @@ class _Scene:
         )
 
 
+def _importance(frame: PosedFrame, resolution_m: float, params: FusionParams) -> float:
+    gsd_m = abs(frame.pose.gsd_m(frame.camera))
+    importance = min(1.0, resolution_m / gsd_m)
+    if frame.pose.source == "gnss":
+        importance *= params.gnss_importance
+    if frame.pose.sigma_m is not None:
+        loose_px = math.hypot(*frame.pose.sigma_m[:2]) / gsd_m
+        importance *= params.loose_px / (params.loose_px + loose_px)
+    return importance
+
+
 def _look(
     views: Views,
     k: int,
@@ -215,18 +254,12 @@ def _look(
     params: FusionParams,
 ) -> None:
     gsd_m = abs(frame.pose.gsd_m(frame.camera))
-    importance = min(1.0, resolution_m / gsd_m)
-    if frame.pose.source == "gnss":
-        importance *= params.gnss_importance
-    if frame.pose.sigma_m is not None:
-        loose_px = math.hypot(*frame.pose.sigma_m[:2]) / gsd_m
-        importance *= params.loose_px / (params.loose_px + loose_px)
+    importance = _importance(frame, resolution_m, params)
     skirt_px = SKIRT_CELLS * params.cell_px * resolution_m / gsd_m
     thumb = relit(photos.thumb(frame.frame_id), frame.gain)
     tone = _shrunk(np.ascontiguousarray(thumb[..., :3]), params.tone_side_px)
     tones = (thumb, tone, _shrunk(tone, params.tone_side_px // 4))
-    min_cos_view = math.cos(math.radians(params.max_view_deg))
-    look(lattice, frame, tones, importance, min_cos_view, skirt_px, views, k)
+    look(lattice, frame, tones, importance, params.min_cos_view, skirt_px, views, k)
 
 
 def _shrunk(image: Rgb, side_px: int) -> Rgb:
@@ -238,48 +271,13 @@ def _shrunk(image: Rgb, side_px: int) -> Rgb:
 def _draw(
     scene: _Scene, lattice: Lattice, resolution_m: float, photos: Photos, params: FusionParams
 ) -> NDArray[np.uint8]:
+    canvas = Canvas(lattice, resolution_m, params.min_cos_view, params.bands, params.sampling == "cubic")
     layers, places, sizes = [], np.empty((*scene.weights.shape, 2), np.int32), []
     for k, frame in enumerate(scene.frames):
-        photo = _at_scale(photos.photo(frame.frame_id), frame, resolution_m)
-        camera = frame.camera.scaled(photo.shape[1], photo.shape[0])
-        places[k] = knots(lattice, frame, camera, math.cos(math.radians(params.max_view_deg)))
-        sizes.append((photo.shape[1], photo.shape[0]))
-        layers.append(_layer(k, frame, photo, scene.labels, places[k], params))
+        layer, size = canvas.layer(k, frame, scene.labels, photos, places[k])
+        layers.append(layer)
+        sizes.append(size)
     return _blend(scene, layers, places, np.array(sizes, np.int32), params)
-
-
-def _at_scale(photo: Rgb, frame: PosedFrame, resolution_m: float) -> Rgb:
-    """The photo, halved until its pixels are less than twice as fine as the raster's, lest it alias."""
-    gsd_m = abs(frame.pose.gsd_m(frame.camera)) * frame.camera.width / photo.shape[1]
-    factor = 1 << max(0, math.floor(math.log2(resolution_m / gsd_m)))
-    if factor == 1:
-        return photo
-    size = (max(2, photo.shape[1] // factor), max(2, photo.shape[0] // factor))
-    return np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _layer(
-    label: int, frame: PosedFrame, photo: Rgb, labels: Labels, places: Int32, params: FusionParams
-) -> Layer:
-    """Warp a winner where it wins, and one cell around, as far as the blending of its pixels looks.
-
-    Its pixels lie within half a cell of its knots' cells, and at each level look one pixel farther at most.
-    """
-    own = (labels == label).astype(np.uint8)
-    needed = cv2.dilate(own, np.ones((3, 3), np.uint8)).astype(bool)
-    rows, cols = np.flatnonzero(needed.any(1)), np.flatnonzero(needed.any(0))
-    top, bottom, left, right = rows[0], rows[-1] + 1, cols[0], cols[-1] + 1
-    # One knot more all round; at the lattice's own edge the last knot is repeated, pixels there are not used.
-    around = np.pad(places, ((1, 1), (1, 1), (0, 0)), mode="edge")[top : bottom + 2, left : right + 2]
-    warped = warp(
-        photo,
-        np.ascontiguousarray(around),
-        needed[top:bottom, left:right],
-        params.cell_px,
-        params.sampling == "cubic",
-        frame.gain,
-    )
-    return Layer(label, int(top), int(left), gaussian_levels(warped, params.bands))
 
 
 def _blend(

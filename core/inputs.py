@@ -14,7 +14,7 @@ from core.geometry import PosedFrame, World
 from core.grid import TileKey
 from core.pyramid import QUALITY
 
-LOOK = 3
+LOOK = 4
 """Raised whenever the same frames would be drawn or encoded otherwise than before."""
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from core.alignment import marks_of
 from core.checkpoints import Checkpoints
 from core.coverage import FUSION, blocks, draw_block, mission_zoom, pyramid, tiles_under
-from core.decode import Pixels, decode_rgb
+from core.decode import Pixels, decode_rgb, decode_to_draw
 from core.errors import NotPlaceable, RejectedFrame
 from core.exposure import balanced
 from core.features import FEATURE_SIDE_PX, Features, extract
@@ -154,7 +154,7 @@ class _Photos:
 
     def photo(self, frame_id: str) -> Pixels:
         if frame_id not in self._decoded:
-            self._decoded[frame_id] = decode_rgb(self._read[frame_id].data, self._max_side)
+            self._decoded[frame_id] = decode_to_draw(self._read[frame_id].data, self._max_side)
         return self._decoded[frame_id]
 
     def thumb(self, frame_id: str) -> Pixels:

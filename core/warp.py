@@ -162,19 +162,28 @@ def _reach_m(frame: PosedFrame, skirt_px: float) -> float:
     return height_m * math.tan(angle) if angle < math.radians(85) else math.inf
 
 
-def knots(lattice: Lattice, frame: PosedFrame, camera: Camera, min_cos_view: float) -> Int32:
-    """Where the knots fall in the photo: (rows, cols, 2) int32 x, y in 1/256 px of `camera`'s size."""
-    out = np.empty((lattice.rows, lattice.cols, 2), np.int32)
+def knots(
+    lattice: Lattice, frame: PosedFrame, camera: Camera, min_cos_view: float, box: tuple[int, int, int, int]
+) -> Int32:
+    """Where the knots fall in the photo: x, y in 1/256 px of `camera`'s size.
+
+    `box`: the first row and column and how many (r, c); one knot more all round is given, (r + 2, c + 2, 2)
+    int32. At the lattice's own edge the last knot is repeated.
+    """
+    top, left, rows, cols = box
+    out = np.empty((rows + 2, cols + 2, 2), np.int32)
     pose = frame.pose
     _knots(
-        lattice.columns.foot,
-        lattice.columns.slope,
+        lattice.columns.foot.reshape(lattice.rows, lattice.cols, 2),
+        lattice.columns.slope.reshape(lattice.rows, lattice.cols, 2),
         np.ascontiguousarray(pose.world_R_cam, np.float64),
         np.asarray(pose.center, np.float64),
         float(pose.ground_h_m),
         intrinsics(camera),
         min_cos_view,
-        out.reshape(-1, 2),
+        top - 1,
+        left - 1,
+        out,
     )
     return out
 
@@ -239,17 +248,20 @@ def _knots(
     h_m: float,
     lens: NDArray[np.float64],
     min_cos_view: float,
+    top: int,
+    left: int,
     out: Int32,
 ) -> None:
     limit_x, limit_y = min(2 * lens[6], 32000.0), min(2 * lens[7], 32000.0)
-    for k in range(foot.shape[0]):
-        u, v, cos_view = project(
-            foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m, h_m, world_R_cam, center, lens
-        )
-        if cos_view < min_cos_view:
-            u, v = -lens[6], -lens[7]
-        out[k, 0] = math.floor(min(max(u, -lens[6]), limit_x) * 256 + 0.5)
-        out[k, 1] = math.floor(min(max(v, -lens[7]), limit_y) * 256 + 0.5)
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            j, i = min(max(top + y, 0), foot.shape[0] - 1), min(max(left + x, 0), foot.shape[1] - 1)
+            east, north = foot[j, i, 0] + slope[j, i, 0] * h_m, foot[j, i, 1] + slope[j, i, 1] * h_m
+            u, v, cos_view = project(east, north, h_m, world_R_cam, center, lens)
+            if cos_view < min_cos_view:
+                u, v = -lens[6], -lens[7]
+            out[y, x, 0] = math.floor(min(max(u, -lens[6]), limit_x) * 256 + 0.5)
+            out[y, x, 1] = math.floor(min(max(v, -lens[7]), limit_y) * 256 + 0.5)
 
 
 @compiled
@@ -266,7 +278,7 @@ def _sample(image: Rgb, right: float, down: float, out: NDArray[np.int64]) -> No
 
 
 @compiled
-def _weight(
+def weight_at(
     u: float, v: float, cos_view: float, width: float, height: float, importance: float, skirt_px: float
 ) -> int:
     """The weight of a photo at one of its pixels, negative beyond its skirt."""
@@ -313,7 +325,7 @@ def _look(
         u, v, cos_view = project(x, y, h_m, world_R_cam, center, lens)
         if cos_view < min_cos_view:
             continue
-        w = _weight(u, v, cos_view, width, height, importance, skirt_px)
+        w = weight_at(u, v, cos_view, width, height, importance, skirt_px)
         if w < 0:
             continue
         j, i = k // cols, k % cols

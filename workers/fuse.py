@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from core.coverage import FUSION, Encoded, block_grid, blocks, draw_block, overview, quarter, tiles_under
-from core.fusion import FrameIndex
-from core.grid import TileKey, children, parent
+from core.fusion import FrameIndex, Territory
+from core.grid import TileKey, children, parent, zoom_resolution_m
 from core.inputs import frame_digest, tile_inputs
 from core.patching import fill_block
 from services.catalog import backlog, missions, poses, tiles
@@ -26,35 +26,92 @@ before_the_fork(warmup.rendering)
 
 pictures = Pictures(store, settings.tile_cache_bytes // 2)
 
+CLOSE_TILES, SPARSEST = 48, 2.0
+"""Tiles are drawn from what is read once as long as the rectangle around them holds so many tiles at most, or
+so many times as many as are wanted.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Sight:
+    """All that neighbouring tiles are drawn from, read at one moment."""
+
+    mission: Mission
+    known: Poses
+    index: FrameIndex
+    photos: MissionPhotos
+    digests: dict[str, bytes] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, mission: Mission, known: Poses) -> _Sight:
+        index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], FUSION)
+        photos = MissionPhotos(shelf, mission.id, mission.tile_side)
+        if known.world is not None and known.zoom is not None:
+            resolution_m = zoom_resolution_m(known.zoom, known.world.lat_deg)
+            photos = replace(photos, likely=Territory(index, resolution_m).share)
+        return cls(mission, known, index, photos)
+
+    def shows(self, zoom: int) -> bool:
+        """Whether tiles of this zoom show anything: those of another than the mission's are overviews."""
+        return self.known.world is not None and self.known.zoom == zoom and bool(self.known.placed)
+
+    def inputs(self, tile: TileKey) -> str:
+        """See Render."""
+        assert self.known.world is not None
+        around = self.index.overlapping(block_grid([tile]), self.known.world)
+        for frame in around:
+            if frame.frame_id not in self.digests:
+                self.digests[frame.frame_id] = frame_digest(frame)
+        digests = [self.digests[f.frame_id] for f in around]
+        return tile_inputs(tile, self.known.world, self.mission.tile_side, digests, FUSION)
+
 
 @stage("fuse")
 def fuse(mission_id: str, keys: Sequence[Sequence[int]]) -> None:
     """Render these tiles from the newest poses and hand them to publish."""
     clock = Stopwatch()
-    for claimed in blocks(TileKey(*key) for key in keys):
+    for group in neighbourhoods(blocks(TileKey(*key) for key in keys)):
         try:
-            _fuse_block(mission_id, claimed, clock)
+            _fuse_group(mission_id, group, clock)
         except FileGone as gone:
             log.warning("photo lost", mission=mission_id, frame=gone.frame_id)
             with db.write() as tx:
                 poses.lose(tx, mission_id, gone.frame_id)
-            send("fuse", mission_id, claimed)
+            send("fuse", mission_id, [tile for block in group for tile in block])
             send("sequence", mission_id)
     go_on("publish", mission_id)
 
 
-def _fuse_block(mission_id: str, claimed: Sequence[TileKey], clock: Stopwatch) -> None:
+def neighbourhoods(found: Iterable[list[TileKey]]) -> list[list[list[TileKey]]]:
+    """Blocks in their order, together as long as they lie close: they are drawn from the same frames."""
+    groups: list[list[list[TileKey]]] = []
+    for block in found:
+        near = [tile for one in (groups[-1] if groups else []) for tile in one] + block
+        xs, ys = [tile.x for tile in near], [tile.y for tile in near]
+        area = (max(xs) - min(xs) + 1) * (max(ys) - min(ys) + 1)
+        if groups and groups[-1][0][0].z == block[0].z and area <= max(SPARSEST * len(near), CLOSE_TILES):
+            groups[-1].append(block)
+        else:
+            groups.append([block])
+    return groups
+
+
+def _fuse_group(mission_id: str, group: Sequence[Sequence[TileKey]], clock: Stopwatch) -> None:
     with db.read() as tx:
-        wanted = backlog.unrendered(tx, mission_id, claimed)
+        wanted = backlog.unrendered(tx, mission_id, [tile for block in group for tile in block])
         if not wanted:
             return  # this task ran before, or somebody else was faster
         mission = missions.get(tx, mission_id)
         known = near(poses.load(tx, mission_id, _box(mission, list(wanted))), mission.tile_zoom)
-    renders, pixels = drawn(mission, known, wanted)
-    with db.write() as tx:
-        tiles.record_renders(tx, mission_id, renders)
-        missions.count_pixels(tx, mission_id, pixels)
-        clock.spend(tx, mission_id, "fuse")
+    sight = _Sight.of(mission, known)
+    for block in group:
+        mine = {tile: wanted[tile] for tile in block if tile in wanted}
+        if mine:
+            renders, pixels = _drawn(sight, mine)
+            with db.write() as tx:
+                tiles.record_renders(tx, mission_id, renders)
+                missions.count_pixels(tx, mission_id, pixels)
+                clock.spend(tx, mission_id, "fuse")
 
 
 def _box(mission: Mission, block: Sequence[Key]) -> TileBox:
@@ -77,43 +134,33 @@ def near(known: Poses, zoom: int | None) -> Poses:
     return replace(known, zoom=zoom, placed=found)
 
 
-def drawn(
-    mission: Mission, known: Poses, wanted: Mapping[Key, ToDraw]
-) -> tuple[list[Render], dict[str, int]]:
-    """The block's tiles, and how many pixels were rendered for what.
-
-    Tiles of another zoom than the mission's are empty (publish makes overviews).
-    """
-    block = [TileKey(*key) for key in wanted]
-    if known.world is None or known.zoom != block[0].z or not known.placed:
+def _drawn(sight: _Sight, wanted: Mapping[TileKey, ToDraw]) -> tuple[list[Render], dict[str, int]]:
+    """The block's tiles, and how many pixels were rendered for what."""
+    block = sorted(wanted)
+    if not sight.shows(block[0].z):
         return [Render(tile, wanted[tile].generation) for tile in block], {}
-    whole = [tile for tile in block if wanted[tile].whole]
-    parts = [tile for tile in block if not wanted[tile].whole]
-    anew, redrawn = _redrawn(mission, known, whole, wanted)
-    filled, added = _filled(mission, known, parts, wanted)
+    anew, redrawn = _redrawn(sight, [tile for tile in block if wanted[tile].whole], wanted)
+    filled, added = _filled(sight, [tile for tile in block if not wanted[tile].whole], wanted)
+    mission = sight.mission
     kind = "sharpen" if mission.sharp_zoom else "heal" if mission.final_generation is None else "final"
     return [*anew, *filled], {kind: redrawn, "new": added}
 
 
 def _redrawn(
-    mission: Mission, known: Poses, block: Sequence[TileKey], wanted: Mapping[Key, ToDraw]
+    sight: _Sight, block: Sequence[TileKey], wanted: Mapping[TileKey, ToDraw]
 ) -> tuple[list[Render], int]:
     """The tiles drawn as a whole, but for those that show what they were drawn from already."""
-    assert known.world is not None
-    index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], FUSION)
-    digests = {f.frame_id: frame_digest(f) for f in index.frames}
-    done, inputs = [], dict[TileKey, str]()
+    mission, world = sight.mission, sight.known.world
+    assert world is not None
+    done, inputs = [], {tile: sight.inputs(tile) for tile in block}
     for tile in block:
-        near = [digests[f.frame_id] for f in index.overlapping(block_grid([tile]), known.world)]
-        inputs[tile] = tile_inputs(tile, known.world, mission.tile_side, near, FUSION)
         shown = wanted[tile].shown
         if shown is not None and shown.inputs == inputs[tile]:
             done.append(replace(shown, generation=wanted[tile].generation))
     left = [tile for tile in block if tile not in {TileKey(*r.key) for r in done}]
     if not left:
         return done, 0
-    photos = MissionPhotos(shelf, mission.id, mission.tile_side)
-    found = draw_block(left, known.world, index, photos)
+    found = draw_block(left, world, sight.index, sight.photos)
     put = [putting(store, mission.id, wanted[t].generation, t, p, inputs[t]) for t, p in found.items()]
     if len(left) == len(wanted) and mission.final_generation is not None:
         made = _with_above(mission.id, put, found)
@@ -142,16 +189,15 @@ def _with_above(
 
 
 def _filled(
-    mission: Mission, known: Poses, block: Sequence[TileKey], wanted: Mapping[Key, ToDraw]
+    sight: _Sight, block: Sequence[TileKey], wanted: Mapping[TileKey, ToDraw]
 ) -> tuple[list[Render], int]:
     """The tiles with what they did not show yet drawn beside what they show."""
     if not block:
         return [], 0
-    assert known.world is not None
+    mission, world = sight.mission, sight.known.world
+    assert world is not None
     shown = {tile: pictures.get(_key(wanted[tile].shown)) for tile in block}
-    index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], FUSION)
-    photos = MissionPhotos(shelf, mission.id, mission.tile_side)
-    patched = fill_block(shown, known.world, index, photos)
+    patched = fill_block(shown, world, sight.index, sight.photos)
     put = [putting(store, mission.id, wanted[t].generation, t, p) for t, p in patched.changed.items()]
     kept = [_as_shown(tile, wanted[tile]) for tile in block if tile not in patched.changed]
     return [*kept, *(begun.result() for begun in put)], patched.pixels

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.decode import decode_rgb
+from core.decode import decode_to_draw
 from core.errors import PhotoLost
 from core.features import Features
+from core.parts import WHOLE, Part, Share, Window, WindowOf
 from services.errors import ObjectNotFound
 from services.storage import ObjectStore
 from workers.app import settings, store
@@ -30,6 +31,14 @@ def features_key(mission_id: str, frame_id: str) -> str:
     return f"missions/{mission_id}/features/{frame_id}"
 
 
+Likely = Callable[[str], Share]
+"""The part of a frame's photo that the map will probably show."""
+
+
+def _whole(frame_id: str) -> Share:
+    return WHOLE
+
+
 class BytesLru:
     """The values used last, as many as fit into `limit_bytes` (at least the newest one)."""
 
@@ -43,6 +52,10 @@ class BytesLru:
         """Forgets all: it can be made again."""
         self._held.clear()
         self.held_bytes = 0
+
+    def forget(self, key: Hashable) -> None:
+        """Lets go of one value."""
+        self.held_bytes -= self._held.pop(key, (None, 0))[1]
 
     def get(self, key: Hashable, make: Callable[[], tuple[Any, int]]) -> Any:
         """The value under `key`, made by `make` (value, bytes) when it is not there."""
@@ -106,16 +119,26 @@ class PhotoShelf:
         thumb: Pixels = self.thumbs.get((mission_id, frame_id), load)
         return thumb
 
-    def picture_of(self, mission_id: str, frame_id: str, max_side: int | None) -> Pixels:
-        """A photo decoded at the mission's resolution. Raises ObjectNotFound."""
+    def part_of(
+        self, mission_id: str, frame_id: str, max_side: int | None, likely: Likely, window_of: WindowOf
+    ) -> Part:
+        """A part of a photo, at the mission's resolution, that holds the window. Raises ObjectNotFound.
+
+        `likely`: what more is kept of it.
+        """
         key = photo_key(mission_id, frame_id)
 
-        def load() -> tuple[Pixels, int]:
-            pixels = decode_rgb(self.store.get(key), max_side)
-            return pixels, pixels.nbytes
+        def load() -> tuple[Part, int]:
+            whole = Part.whole(decode_to_draw(self.store.get(key), max_side))
+            size = (whole.width, whole.height)
+            part = whole.cut(window_of(*size).joined(likely(frame_id).window(*size)))
+            return part, part.pixels.nbytes
 
-        pixels: Pixels = self.pictures.get((key, max_side), load)
-        return pixels
+        part: Part = self.pictures.get((key, max_side), load)
+        if not part.holds(window_of(part.width, part.height)):
+            self.pictures.forget((key, max_side))
+            part = self.pictures.get((key, max_side), load)
+        return part
 
 
 shelf = PhotoShelf.of(store, settings.photo_cache_bytes)
@@ -133,19 +156,24 @@ class FileGone(PhotoLost):
 
 @dataclass(frozen=True, slots=True)
 class MissionPhotos:
-    """One mission's photos as `core.fusion` asks for them."""
+    """One mission's photos as `core.parts` asks for them."""
 
     shelf: PhotoShelf
     mission_id: str
     max_side: int | None
+    likely: Likely = _whole
 
     def photo(self, frame_id: str) -> Pixels:
-        """See core.fusion.Photos. Raises FileGone."""
+        """See core.parts.Photos. Raises FileGone."""
+        return self.part(frame_id, lambda width, height: Window(0, 0, width, height)).pixels
+
+    def part(self, frame_id: str, window_of: WindowOf) -> Part:
+        """See core.parts.Parts. Raises FileGone."""
         try:
-            return self.shelf.picture_of(self.mission_id, frame_id, self.max_side)
+            return self.shelf.part_of(self.mission_id, frame_id, self.max_side, self.likely, window_of)
         except ObjectNotFound as error:
             raise FileGone(frame_id) from error
 
     def thumb(self, frame_id: str) -> Pixels:
-        """See core.fusion.Photos."""
+        """See core.parts.Photos."""
         return self.shelf.thumb_of(self.mission_id, frame_id)

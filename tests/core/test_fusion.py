@@ -192,7 +192,7 @@ def test_what_was_not_warped_is_not_read(
         spoilt.append(int(idle.sum()))
         return out
 
-    monkeypatch.setattr("core.fusion.warp", junk)
+    monkeypatch.setattr("core.layers.warp", junk)
     assert np.array_equal(render(grid, WORLD, frames, album, params), clean)
     assert sum(spoilt) > 100_000
 

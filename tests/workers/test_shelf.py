@@ -119,3 +119,24 @@ def test_five_thousand_frames_and_their_tiles_stay_within_the_settings() -> None
     # A sixteenth each for features and thumbnails, two for words: here only photos and tiles are held.
     limit = photo_bytes * 12 / 16 + tile_bytes
     assert 0.9 * limit <= most <= 1.1 * limit
+
+
+@pytest.mark.usefixtures("modules")
+def test_a_photo_of_which_too_little_was_kept_is_decoded_again() -> None:
+    from core.parts import Share, Window
+    from workers.photos import MissionPhotos, PhotoShelf
+
+    shelf = PhotoShelf.of(_Album(), 4_000_000)
+    mission = MissionPhotos(shelf, "m", None, lambda frame_id: Share(0.25, 0.25, 0.5, 0.5))
+    whole = MissionPhotos(PhotoShelf.of(_Album(), 4_000_000), "m", None).photo("1")
+    for asked, held in (
+        ((40, 30, 50, 40), (32, 24, 64, 48)),  # what it will probably show holds it
+        ((60, 30, 70, 40), (32, 24, 70, 48)),
+        ((60, 30, 70, 40), (32, 24, 70, 48)),
+        ((0, 0, 128, 96), (0, 0, 128, 96)),
+    ):
+        part = mission.part("1", lambda width, height, asked=asked: Window(*asked))
+        assert part.window == Window(*held)
+        left, top, right, bottom = held
+        assert np.array_equal(part.pixels, whole[top:bottom, left:right])
+        assert shelf.pictures.held_bytes == part.pixels.nbytes
