@@ -120,7 +120,11 @@ class _Surroundings:
 
     def __init__(self, known: dict[str, GraphFrame], solution: Solution) -> None:
         self._known, self._solution = known, solution
-        self._visual = sorted(k for k, p in solution.poses.items() if p.source != "gnss" and k in known)
+
+    @cached_property
+    def _visual(self) -> list[str]:
+        poses = self._solution.poses
+        return sorted(k for k, p in poses.items() if p.source != "gnss" and k in self._known)
 
     @cached_property
     def _tree(self) -> cKDTree:
