@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from core import errors
 from core.coverage import mission_zoom, moved_px, outline_px, tiles_under
+from core.exposure import Thumb, fitted
 from core.frame import FrameMeta
 from core.geometry import Pose, PosedFrame
 from core.grid import TileKey, ancestors
@@ -27,6 +28,8 @@ from workers.shown import Shown
 
 SHOWN_MOVE_PX = 0.5
 SHOWN_GAIN = 0.02
+EXPOSED_BY = 3
+"""By so many others a new frame's exposure is told."""
 
 
 @dataclass
@@ -139,7 +142,6 @@ def joined(
     for frame_id in sorted(set(new_ids) & set(solution.poses)):
         camera = cameras[keys[frame_id]]
         frame = PosedFrame(frame_id, camera, solution.poses[frame_id])
-        frame = replace(frame, gain=_gain_nearby(frame, layout.frames))
         tiles = frozenset(tiles_under(frame, layout.world, layout.zoom))
         if 0 < len(tiles) <= MOST_TILES:
             frames[frame_id], under[frame_id] = frame, tiles
@@ -149,13 +151,30 @@ def joined(
     return replace(layout, cameras=cameras, frames=frames, under=under, rejected=rejected, waiting=waiting)
 
 
-def _gain_nearby(frame: PosedFrame, others: Mapping[str, PosedFrame]) -> tuple[float, float, float]:
-    """Until the next balance: exposure changes slowly, and the nearest frame saw much the same ground."""
-    same = [f for _, f in sorted(others.items()) if f.camera == frame.camera]
-    if not same:
-        return (1.0, 1.0, 1.0)
-    centers = np.array([f.pose.center for f in same])
-    return same[int(((centers - frame.pose.center) ** 2).sum(1).argmin())].gain
+def exposed(
+    layout: Layout, new_ids: Collection[str], matches: Sequence[PairMatch], thumb: Callable[[str], Thumb]
+) -> Layout:
+    """The layout with its new frames as bright as what they overlap, until the next balance of all."""
+    new = [layout.frames[k] for k in sorted(set(new_ids) & layout.frames.keys())]
+    near = {k for frame in new for k in _alike(frame, layout.frames, set(new_ids), matches)}
+    thumbs = {k: thumb(k) for k in sorted(near | {f.frame_id for f in new})}
+    lit = fitted(new, [layout.frames[k] for k in sorted(near)], thumbs)
+    return replace(layout, frames={**layout.frames, **{f.frame_id: f for f in lit}})
+
+
+def _alike(
+    frame: PosedFrame, frames: Mapping[str, PosedFrame], new_ids: set[str], matches: Sequence[PairMatch]
+) -> list[str]:
+    """A few of those that are not new and show the same ground: the best matched, or else the nearest."""
+    mine = [m for m in matches if m.accepted and frame.frame_id in (m.low, m.high)]
+    found = [(-len(m.uv_low), m.high if m.low == frame.frame_id else m.low) for m in mine]
+    found = [(rank, k) for rank, k in found if k in frames and k not in new_ids]
+    if found:
+        return [k for _, k in sorted(found)[:EXPOSED_BY]]
+    others = sorted(frames.keys() - new_ids)
+    centers = np.array([frames[k].pose.center for k in others]).reshape(-1, 3)
+    away_m = np.linalg.norm(centers - frame.pose.center, axis=1)
+    return [others[k] for k in np.argsort(away_m, kind="stable")[:EXPOSED_BY]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from workers import solving, surveyed, tying, wanted, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
 from workers.dealing import AHEAD_TILES, runs, tasks
 from workers.lease import held
-from workers.posing import Known, changed, everything, joined, lifts, sharper, update_of
+from workers.posing import Known, changed, everything, exposed, joined, lifts, sharper, update_of
 
 GROWTH = 2.0
 """All poses are solved again when the mission, or its frames with GPS, grew so many times since the last."""
@@ -200,9 +200,11 @@ def _pose(mission: Mission, epoch: int, new: Sequence[Frame]) -> None:
         assert before is not None
         frames_here = [known.seen[k] for k in sorted(before.frames.keys() | new_ids)]
         found = place(solution, frames_here, new_ids, matches)
-        after = joined(before, found, new_ids, known.camera_keys, mission.mode)
+        keys = {k: known.seen[k].meta.camera_key for k in new_ids}
+        grown = joined(before, found, new_ids, keys, mission.mode)
+        after = exposed(grown, new_ids, matches, solving.thumbs(mission.id))
         dirty = known.grown(after, new_ids)
-        update = update_of(after, known.camera_keys, new_ids)
+        update = update_of(after, keys, new_ids)
     with db.write() as tx:
         generation = poses.save(tx, mission.id, epoch, replace(update, dirty=dirty))
         tiles.fuse_frames(tx, mission.id)  # whose ground is all shown already waits for nobody's tiles
