@@ -6,11 +6,11 @@ import numpy as np
 
 from core.coverage import draw_block, mission_zoom, tiles_under
 from core.exposure import balanced
-from core.features import FeatureParams, extract
+from core.features import FeatureParams, Features, extract
 from core.frame import Attitude, FrameMeta, GpsFix
 from core.fusion import FrameIndex
 from core.geometry import Array, Camera, Pose, PosedFrame, World
-from core.matching import MatchCounts, PairMatch
+from core.matching import MatchCounts, MatchParams, PairMatch, match_pair
 from core.pyramid import Rgba
 from core.shrink import shrunk_by_area
 
@@ -46,9 +46,23 @@ def _meta(k: int) -> FrameMeta:
     return FrameMeta(SIDE_PX, height, 200.0, 1.7e9 + k, fix, HEIGHT_M, Attitude(0.0), "drone", "body")
 
 
+def _matching() -> None:
+    rng, count = np.random.default_rng(0), 2 * MatchParams().strongest
+    found = Features(
+        keypoints=rng.uniform(0, SIDE_PX * 3 // 4, (count, 2)).astype(np.float32),
+        angle_rad=np.zeros(count, np.float32),
+        scale_px=np.ones(count, np.float32),
+        descriptors=rng.integers(0, 100, (count, 128)).astype(np.uint8),
+        words=np.zeros(1, np.float32),
+        thumb=np.zeros((1, 1, 4), np.uint8),
+    )
+    match_pair("0", found, "1", found, _camera(), _camera())
+
+
 def rendering() -> None:
-    """Features, rendering, encoding."""
+    """Features, matching, rendering, encoding."""
     photos = _Chequered()
+    _matching()
     shrunk_by_area(photos.photo("0"), (SIDE_PX // 2, SIDE_PX * 3 // 8))
     extract(photos.photo("0"), (SIDE_PX, SIDE_PX), FeatureParams())
     frames = [
