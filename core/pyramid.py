@@ -39,12 +39,20 @@ def reduce(children: Sequence[Rgba | None]) -> Rgba:
 def halve(rgba: Rgba) -> Rgba:
     """The 2 × 2 area mean, weighted by alpha, of RGBA (2H, 2W, 4) uint8 → (H, W, 4) uint8."""
     height, width = rgba.shape[0] // 2, rgba.shape[1] // 2
-    if (rgba[..., 3] == 255).all():
+    rgba = np.ascontiguousarray(rgba)
+    if _alpha(np.bitwise_and, rgba) == 255:
         # INTER_AREA by exactly 2 is integer: (a + b + c + d + 2) >> 2.
         return np.asarray(cv2.resize(rgba, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     out = np.empty((height, width, 4), np.uint8)
-    _halve(np.ascontiguousarray(rgba), out)
+    _halve(rgba, out)
     return out
+
+
+def _alpha(together: np.ufunc, rgba: Rgba) -> int:
+    """The alphas of all pixels, contiguous in memory, joined bit by bit; read as whole pixels, eight times
+    as fast as alone.
+    """
+    return int(np.asarray(together.reduce(rgba.view(np.uint32), axis=None)).tobytes()[3])
 
 
 @compiled
@@ -63,18 +71,17 @@ def _halve(rgba: Rgba, out: Rgba) -> None:
 
 def encode(rgba: Rgba, quality: int = QUALITY) -> tuple[bytes, str] | None:
     """A tile's bytes and media type: JPEG when opaque, WebP when not, None when nothing of it is known."""
-    alpha = rgba[..., 3]
-    if not alpha.any():
+    pixels = np.ascontiguousarray(rgba)
+    if not _alpha(np.bitwise_or, pixels):
         return None
-    if (alpha == 255).all():
-        pixels = np.ascontiguousarray(rgba)
+    if _alpha(np.bitwise_and, pixels) == 255:
         return simplejpeg.encode_jpeg(
             pixels, quality=quality, colorspace="RGBX", colorsubsampling="420"
         ), JPEG
     out = io.BytesIO()
     # method 1: a third of the bytes less than method 0, which hardly packs the alpha, and three times as fast
     # as the default for a twentieth more.
-    Image.fromarray(rgba, "RGBA").save(out, "WEBP", quality=quality, method=1)
+    Image.fromarray(pixels, "RGBA").save(out, "WEBP", quality=quality, method=1)
     return out.getvalue(), WEBP
 
 

@@ -86,6 +86,19 @@ def test_one_visible_pixel_is_enough() -> None:
     assert decode(encoded[0])[100, 200, 3] == 255
 
 
+def test_one_pixel_that_is_not_opaque_is_enough() -> None:
+    for alpha in (254, 127, 0):
+        leaky = tile(3)
+        leaky[511, 0, 3] = alpha
+        encoded = encode(leaky)
+        assert encoded is not None
+        assert encoded[1] == WEBP
+        assert halve(leaky)[255, 0, 3] == (3 * 255 + alpha + 2) // 4
+        faint = np.zeros((512, 512, 4), np.uint8)
+        faint[0, 511, 3] = alpha
+        assert (encode(faint) is None) == (alpha == 0)
+
+
 def test_equal_pixels_give_equal_bytes() -> None:
     canvas = np.zeros((512, 1024, 4), np.uint8)
     for alpha in ("opaque", "edge"):
