@@ -49,7 +49,7 @@ def publish(mission_id: str) -> None:
         try:
             with _at_it(mission) as mine:
                 if not mine:
-                    break  # who is at it looks again when that is done
+                    return  # who is at it looks again when that is done, and wakes the sequencer
                 changes = _with_overviews(mission, pending, bounds, left)
                 with db.write() as tx:
                     revision = tiles.publish(tx, mission_id, mission.revision, changes, pending)

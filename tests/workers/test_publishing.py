@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from services.catalog import missions
+from services.catalog import backlog, missions, publishing
+from services.tables import DirtyTile
 
 
 def test_the_final_pass_leaves_no_overview_of_native_tiles_to_publish(
@@ -65,3 +66,32 @@ def test_the_last_revision_is_a_small_one(bench: Any, monkeypatch: pytest.Monkey
     assert publish._worth_it(2 * few, few, final=True)
     assert not publish._worth_it(2 * few, few + 1, final=True)
     assert not publish._worth_it(few, 1, final=True)  # the last one may as well show these too
+
+
+def test_who_finds_another_publishing_wakes_nobody(bench: Any, photos: list[tuple[str, bytes]]) -> None:
+    """Or the sequencer, that sees tiles to publish, and the workers would wake each other all the while."""
+    bench.upload(photos[:3])
+    while bench.queue:
+        name, args = bench.queue.pop(0)
+        if name != "publish":
+            bench.handle(name, *args)
+    with bench.db.write() as tx:
+        publishing.claim(tx, bench.mission_id, missions.get(tx, bench.mission_id).revision, 30.0)
+    assert _to_publish(bench)
+    bench.handle("publish", bench.mission_id)
+    assert bench.queue == []
+    assert _to_publish(bench)
+    with bench.db.write() as tx:  # as when that one was killed, and time went by
+        publishing.release(tx, bench.mission_id, _claimed_at(tx, bench.mission_id))
+    bench.handle("publish", bench.mission_id)
+    assert not _to_publish(bench)
+    assert bench.queue == [("sequence", (bench.mission_id,))]
+
+
+def _to_publish(bench: Any) -> int:
+    with bench.db.read() as tx:
+        return int(backlog.of(tx, bench.mission_id, 30).to_publish)
+
+
+def _claimed_at(tx: Any, mission_id: str) -> float:
+    return float(tx.query(DirtyTile).filter_by(mission_id=mission_id).first().claimed_at)
