@@ -16,6 +16,7 @@ from core.cog import MosaicParams, MosaicPlan, write_mosaic
 from core.decode import decode_rgb
 from core.features import extract
 from core.mosaic import Mosaic, frame_id_of
+from services.catalog import exports, missions
 
 PARAMS = MosaicParams(piece_px=256, window_px=256, block_px=128, threads=2)
 
@@ -128,3 +129,35 @@ def test_plans_that_differ_have_other_pieces(plan: MosaicPlan) -> None:
     again = MosaicPlan.of(plan.world, frames[::-1], 0.2, replace(PARAMS, threads=7))
     assert again.digest() == plan.digest()
     assert len({plan.digest(), other.digest(), replace(plan, grid=replace(plan.grid, width=9)).digest()}) == 3
+
+
+def test_a_worker_that_is_asked_too_draws_for_the_one_who_makes_the_file(
+    bench: Any, photos: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench.upload(photos[:4])
+    bench.drain()
+    bench.finalise()
+    bench.drain()
+    export, name = bench.modules["export"], "mosaic.tif"
+    write, drawn = export.SharedMosaic.write, []
+
+    def write_with_help(mosaic: Any, path: Path, crs: str | None) -> None:
+        bench.handle("export", bench.mission_id, name)
+        drawn.append(all(mosaic.plan.is_drawn(p, mosaic.folder) for p in mosaic.plan.pieces()))
+        write(mosaic, path, crs)
+
+    monkeypatch.setattr(export.SharedMosaic, "write", write_with_help)
+    with bench.db.write() as tx:
+        exports.request(tx, bench.mission_id, name)
+    bench.handle("export", bench.mission_id, name)
+    assert drawn == [True]
+    with bench.db.read() as tx:
+        made = exports.get(tx, bench.mission_id, name)
+        mission = missions.get(tx, bench.mission_id)
+    assert made is not None
+    assert made.state == "ready"
+    again = export._shared(mission, name)
+    plan = again.plan
+    write_mosaic(tmp_path / name, plan.world, plan.index.frames, again.photos, plan.grid.gsd_m)
+    assert bench.modules["app"].store.get(made.object_key) == (tmp_path / name).read_bytes()
+    assert not [p for p in export.FOLDER.glob(f"{bench.mission_id}-*") if p.is_dir()]
