@@ -78,7 +78,7 @@ def _waits(mission_id: str) -> bool:
         desk = backlog.of(tx, mission_id, CLAIM_TTL_S)
     if mission.state == "finalising" and 0 < desk.unread < WORTH_A_LOOK:
         if desk.unread <= settings.workers:  # fewer than there are workers for
-            _ask(mission_id, wanted.ahead(mission), SPARE)
+            _ask(mission_id, wanted.ahead(mission))
         return False  # the last of them wakes us
     if mission.state == "finalising" and not desk.unread and wanted.missing(mission_id):
         return False
@@ -181,10 +181,10 @@ def _tie(mission: Mission, epoch: int, desk: Backlog) -> bool:
     return False
 
 
-def _ask(mission_id: str, ask: Sequence[PairKey], priority: int | None = None) -> None:
+def _ask(mission_id: str, ask: Sequence[PairKey]) -> None:
     """Have these pairs matched."""
     for some in tasks(ask, settings.workers):
-        send("match", mission_id, None, some, priority=priority)
+        send("match", mission_id, None, some)
 
 
 def _pose(mission: Mission, epoch: int, new: Sequence[Frame]) -> None:
