@@ -11,10 +11,12 @@ from core.frame import Attitude, FrameMeta, GpsFix
 from core.fusion import FrameIndex
 from core.geometry import Array, Camera, Pose, PosedFrame, World
 from core.matching import MatchCounts, MatchParams, PairMatch, match_pair
-from core.pyramid import Rgba
+from core.pyramid import Rgba, halve
 from core.shrink import shrunk_by_area
 
 HEIGHT_M, STEP_M, SIDE_PX = 60.0, 12.0, 256
+FRAMES = 34
+"""More than are solved as one dense matrix."""
 NORTH_UP_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 WORLD = World(47.0, 8.0, 400.0)
 
@@ -74,16 +76,18 @@ def rendering() -> None:
     assert zoom is not None
     tiles = sorted(tiles_under(frames[0], WORLD, zoom))
     draw_block(tiles[:2], WORLD, FrameIndex(frames), photos)
+    halve(np.zeros((2, 2, 4), np.uint8))
 
 
 def solving() -> None:
     """The pose graph, and placing a frame in it."""
     from core.pose_graph import GraphFrame, place, solve
 
-    frames = [GraphFrame(f"{k:032x}", f"{k}.jpg", _meta(k)) for k in range(6)]
-    matches = [_match(i, j) for i in range(6) for j in range(i + 1, 6) if abs(i - j) in (1, 3)]
-    solution = solve(frames[:5], [m for m in matches if m.high != frames[5].frame_id])
-    place(solution, frames, [frames[5].frame_id], matches)
+    frames = [GraphFrame(f"{k:032x}", f"{k}.jpg", _meta(k)) for k in range(FRAMES)]
+    matches = [_match(k - step, k) for k in range(FRAMES) for step in (3, 1) if k >= step]
+    last = frames[-1].frame_id
+    solution = solve(frames[:-1], [m for m in matches if m.high != last])
+    place(solution, frames, [last], matches)
 
 
 def _match(i: int, j: int) -> PairMatch:
