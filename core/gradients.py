@@ -18,8 +18,7 @@ SIGMA = 1.6
 TURN_BINS = 36
 SECOND_PEAK = 0.8
 MOST_DIRECTIONS = 3
-# A direction is told by a disc of three sigmas of half as much again as the keypoint's own.
-DISC_SIGMAS = 4.5
+# Three sigmas, of half as much again as a keypoint's own, of the largest there is with one layer.
 WIDEST_PX = 24
 
 
