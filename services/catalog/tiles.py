@@ -235,24 +235,27 @@ def publish(
     return row.revision
 
 
+_FRAME, _POSE, _STALE = table(Frame).c, table(FramePose).c, table(DirtyTile).c
+_MISSING = exists().where(
+    _STALE.mission_id == _POSE.mission_id,
+    _STALE.z == _POSE.z,
+    _STALE.x.between(_POSE.x0, _POSE.x1),
+    _STALE.y.between(_POSE.y0, _POSE.y1),
+    _STALE.since <= _POSE.generation,
+    _STALE.priority < HEAL,  # where poses moved, it is shown already
+)
+_SHOWN = (
+    select(_FRAME.id)
+    .join(table(FramePose), and_(_POSE.mission_id == _FRAME.mission_id, _POSE.frame_id == _FRAME.id))
+    .where(_FRAME.mission_id == bindparam("mission"), _FRAME.state == "posed", ~_MISSING)
+)
+
+
 def fuse_frames(tx: Session, mission_id: str, now: float | None = None) -> Sequence[str]:
     """Posed → fused for the frames whose tiles show them; their ids."""
     hold(tx, mission_id)
     now = clock(now)
-    missing = exists().where(
-        DirtyTile.mission_id == FramePose.mission_id,
-        DirtyTile.z == FramePose.z,
-        DirtyTile.x.between(FramePose.x0, FramePose.x1),
-        DirtyTile.y.between(FramePose.y0, FramePose.y1),
-        DirtyTile.since <= FramePose.generation,
-        DirtyTile.priority < HEAL,  # where poses moved, it is shown already
-    )
-    shown = (
-        select(Frame.id)
-        .join(FramePose, and_(FramePose.mission_id == Frame.mission_id, FramePose.frame_id == Frame.id))
-        .where(Frame.mission_id == mission_id, Frame.state == "posed", ~missing)
-    )
-    fused = sorted(tx.scalars(shown))
+    fused = sorted(tx.execute(_SHOWN, {"mission": mission_id}).scalars())
     for some in chunks(fused):
         tx.execute(
             update(Frame)
