@@ -34,7 +34,7 @@ class ScaleSpace:
 class Spots:
     """Extrema of the scale space, (N,) each: `octave`, `layer` int64; `at` (N, 3) float32: x, y in pixels of
     the octave and the layer, all to a fraction; `response`: contrast in grey levels. In the order of octave,
-    layer, row, column.
+    row, layer, column.
     """
 
     octave: NDArray[np.int64]
