@@ -6,10 +6,7 @@ import math
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from io import BytesIO
 from typing import Any
-
-from PIL import Image
 
 from core.xmp import parse_xmp
 
@@ -17,6 +14,15 @@ _EXIF_HEAD = b"Exif\x00\x00"
 _XMP_HEAD = b"http://ns.adobe.com/xap/1.0/\x00"
 _EXIF_IFD, _GPS_IFD, _MAKER_NOTE, _TIFF_XMP = 0x8769, 0x8825, 0x927C, 700
 _FLOAT_TYPE = 11
+
+_ORDERS = {b"II*\x00": "<", b"II\x00*": "<", b"MM\x00*": ">", b"MM*\x00": ">"}  # two are wrong, yet written
+_RAW, _ASCII = "B", "s"
+_TEXTS = (_RAW, _ASCII)
+# How the kinds of values are written, in the words of `struct`; two letters: a fraction.
+_KINDS = dict(enumerate((_RAW, _ASCII, "H", "I", "II", "b", _RAW, "h", "i", "ii", "f", "d", "I"), start=1))
+_SIZES = {letter: struct.calcsize(f"={letter}") for letter in "BsHIbhifd"}
+_LONGEST_LIST = 64
+"""More numbers than these are where a TIFF's strips lie, not what is known of the photo."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,21 +38,17 @@ class Tags:
 
 def read_tags(data: bytes) -> Tags:
     """Every tag of a JPEG's or TIFF's bytes that can be read; on garbage fewer, or none. Never raises."""
-    exif_block, xmp_packet = _blocks(data)
-    directory = Image.Exif()
-    try:
-        if exif_block:
-            directory.load(exif_block)
-        elif data[:2] in (b"II", b"MM"):
-            directory.load_from_fp(BytesIO(data))
-            xmp_packet = _bytes(directory.get(_TIFF_XMP))
-    except Exception:  # Pillow raises whatever struct, int and decode do on broken directories
-        directory = Image.Exif()
-    exif = _directory(directory, _EXIF_IFD)
+    block, xmp_packet = _blocks(data) if data.startswith(b"\xff\xd8") else (data, b"")
+    order = _ORDERS.get(block[:4])
+    if order is None:
+        return Tags(xmp=parse_xmp(xmp_packet) if xmp_packet else {})
+    image = _directory(block, order, int.from_bytes(block[4:8], "little" if order == "<" else "big"))
+    exif, gps = (_directory(block, order, image.get(tag)) for tag in (_EXIF_IFD, _GPS_IFD))
+    xmp_packet = xmp_packet or _bytes(image.get(_TIFF_XMP))
     return Tags(
-        image=dict(_items(directory)),
+        image=image,
         exif=exif,
-        gps=_directory(directory, _GPS_IFD),
+        gps=gps,
         dji=_dji_maker_note(_bytes(exif.get(_MAKER_NOTE))),
         xmp=parse_xmp(xmp_packet) if xmp_packet else {},
     )
@@ -83,7 +85,7 @@ def _blocks(data: bytes) -> tuple[bytes, bytes]:
     exif_block, xmp_packet = b"", b""
     for marker, segment in _segments(data):
         if marker == 0xE1 and segment.startswith(_EXIF_HEAD):
-            exif_block = exif_block or segment
+            exif_block = exif_block or segment[len(_EXIF_HEAD) :]
         elif marker == 0xE1 and segment.startswith(_XMP_HEAD):
             xmp_packet = xmp_packet or segment[len(_XMP_HEAD) :]
     return exif_block, xmp_packet
@@ -103,20 +105,34 @@ def _segments(data: bytes) -> Iterator[tuple[int, bytes]]:
         at += 2 + max(size, 2)
 
 
-def _directory(exif: Image.Exif, tag: int) -> dict[int, Any]:
-    try:
-        return dict(_items(exif.get_ifd(tag)))
-    except Exception:  # as above: a broken sub-directory is a missing one
+def _directory(block: bytes, order: str, at: Any) -> dict[int, Any]:
+    """The directory that begins at byte `at`, as far as it is whole: one broken entry hides no other."""
+    if not isinstance(at, int) or not 8 <= at <= len(block) - 2:
         return {}
+    (count,) = struct.unpack_from(f"{order}H", block, at)
+    entry = struct.Struct(f"{order}HHI")
+    found: dict[int, Any] = {}
+    for start in range(at + 2, min(at + 2 + 12 * count, len(block) - 11), 12):
+        tag, kind, n = entry.unpack_from(block, start)
+        letters = _KINDS.get(kind, "")
+        size = n * sum(_SIZES[letter] for letter in letters)
+        if size > 4:
+            (start,) = struct.unpack_from(f"{order}I", block, start + 8)
+        else:
+            start += 8
+        if size and start + size <= len(block) and (letters in _TEXTS or n <= _LONGEST_LIST):
+            found[tag] = _value(block[start : start + size], letters, n, order)
+    return found
 
 
-def _items(directory: Any) -> Iterator[tuple[int, Any]]:
-    """Tag by tag: Pillow unpacks lazily, and one broken value must not hide the others."""
-    for tag in list(directory):
-        try:
-            yield int(tag), directory[tag]
-        except Exception:
-            continue
+def _value(raw: bytes, letters: str, n: int, order: str) -> Any:
+    """Bytes, a text, a number, or a tuple of numbers; a fraction over nothing is NaN."""
+    if letters in _TEXTS:
+        return raw if letters == _RAW else raw.removesuffix(b"\x00").decode("latin-1")
+    parts = struct.unpack(f"{order}{letters * n}", raw)
+    if len(letters) == 2:
+        parts = tuple(a / b if b else math.nan for a, b in zip(parts[::2], parts[1::2], strict=True))
+    return parts[0] if n == 1 else parts
 
 
 def _bytes(value: Any) -> bytes:

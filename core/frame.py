@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from core.geometry import Camera
@@ -69,7 +69,8 @@ class FrameMeta:
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object that `from_json` turns back into an equal value."""
-        return asdict(self)
+        nested = {"gps": self.gps and _fields(self.gps), "attitude": _fields(self.attitude)}
+        return _fields(self) | nested
 
     @classmethod
     def from_json(cls, doc: Mapping[str, Any]) -> FrameMeta:
@@ -77,3 +78,7 @@ class FrameMeta:
         gps, attitude = doc["gps"], doc["attitude"]
         rest = {k: v for k, v in doc.items() if k not in ("gps", "attitude")}
         return cls(**rest, gps=GpsFix(**gps) if gps else None, attitude=Attitude(**attitude))
+
+
+def _fields(part: FrameMeta | GpsFix | Attitude) -> dict[str, Any]:
+    return {field.name: getattr(part, field.name) for field in fields(part)}

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import math
+import struct
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -365,6 +367,17 @@ FULL = photo(
     gps=gps_tags(46.8, -92) | {7: (12.0, 0.0, 1.5), 29: "2024:05:01", 15: 70.0, 17: 71.0, 31: 2.0},
     xmp=packet(DJI),
 )
+
+
+@pytest.mark.parametrize(("tag", "lost"), [(0x010F, "DJI"), (0x0110, "FC300S")])
+def test_one_broken_entry_hides_no_other(tag: int, lost: str) -> None:
+    (found,) = (at for order in "<>" if (at := FULL.find(struct.pack(f"{order}HH", tag, 2))) > 0)
+    broken = bytearray(FULL)
+    broken[found + 2 : found + 4] = b"\xee\xee"  # a kind of value that nobody knows
+    before, after = read(FULL), read(bytes(broken))
+    assert lost in before.body
+    assert lost not in after.body
+    assert replace(after, body=before.body, f_px=before.f_px) == before
 
 
 @settings(deadline=None, max_examples=400)
