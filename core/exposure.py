@@ -81,6 +81,10 @@ class _Sightings:
         return np.asarray(np.add.reduceat(values, self.start, axis=0))
 
 
+FLAT_RAY = 0.5
+"""How far a ray near a photo's corner goes sideways a unit of its length."""
+FEW = 16
+"""Up to so many unknown gains are solved for densely, without sparse matrices' overhead."""
 Solver = Callable[[Design, _Sightings, Array, Array], Array]
 
 
@@ -134,6 +138,14 @@ def fitted(
 def replace_light(frame: PosedFrame, gain: Gain, falloff: tuple[float, ...]) -> PosedFrame:
     """The same frame with another gain and falloff."""
     return replace(frame, gain=gain, camera=replace(frame.camera, falloff=falloff))
+
+
+def light_apart(one: PosedFrame, other: PosedFrame) -> float:
+    """By how much, at most, the logarithm of the light in which a frame is drawn is another in these two."""
+    gain = np.abs(np.log(one.gain) - np.log(other.gain))
+    lens = _by_channel(one.camera.falloff) - _by_channel(other.camera.falloff)
+    edge = np.abs(lens[:, :3].sum(1)) + FLAT_RAY * np.hypot(lens[:, 3], lens[:, 4])
+    return float((gain + edge).max())
 
 
 def _sightings(
@@ -262,10 +274,15 @@ def _fit(
     lenses = np.array([_by_channel(f.camera.falloff) for f in frames])
     gains = np.array([(1.0, 1.0, 1.0) if new else f.gain for f, new in zip(frames, free, strict=True)])
     known = np.log(gains)[seen.frame] - np.einsum("mct,mt->mc", lenses[seen.frame], seen.terms)
-    design = -(seen.frame[:, None] == np.flatnonzero(free)).astype(float)
+    mine = np.flatnonzero(free[seen.frame])
+    at = (np.cumsum(free) - 1)[seen.frame[mine]]
+    design = sparse.csr_matrix((-np.ones(len(mine)), (mine, at)), shape=(len(seen.frame), int(free.sum())))
     prior = np.full(design.shape[1], params.gain_sigma**-2)
-    even = replace(seen, log=seen.log + known)
-    return np.asarray(np.round(np.exp(_reweighted(design, even, prior, params, _densely)), 5), float)
+    even, few = replace(seen, log=seen.log + known), design.shape[1] <= FEW
+    answer = _reweighted(
+        design.toarray() if few else design, even, prior, params, _densely if few else _sparsely
+    )
+    return np.asarray(np.round(np.exp(answer), 5), float)
 
 
 def _reweighted(

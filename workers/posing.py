@@ -11,7 +11,7 @@ import numpy as np
 
 from core import errors
 from core.coverage import mission_zoom, moved_px, outline_px, tiles_under
-from core.exposure import Thumb, fitted
+from core.exposure import Thumb, fitted, light_apart
 from core.frame import FrameMeta
 from core.geometry import Pose, PosedFrame
 from core.grid import TileKey, ancestors
@@ -27,7 +27,7 @@ from services.tables import Frame
 from workers.shown import Shown
 
 SHOWN_MOVE_PX = 0.5
-SHOWN_GAIN = 0.02
+SHOWN_LIGHT = 0.02
 EXPOSED_BY = 3
 """By so many others a new frame's exposure is told."""
 
@@ -222,15 +222,14 @@ def changed(before: Layout | None, after: Layout) -> Changes:
 
 
 def _off_px(old: PosedFrame, new: PosedFrame | None, before: Layout, after: Layout) -> float:
-    """How far the frame has moved; another gain counts as if it had."""
+    """How far the frame has moved; another light counts as if it had."""
     if old is new:
         return 0.0
     if new is None:
         return math.inf
     assert after.zoom is not None
     move = moved_px(outline_px(old, before.world, after.zoom), outline_px(new, after.world, after.zoom))
-    gain = float(np.abs(np.subtract(old.gain, new.gain)).max())
-    return max(move, gain / SHOWN_GAIN * SHOWN_MOVE_PX)
+    return max(move, light_apart(old, new) / SHOWN_LIGHT * SHOWN_MOVE_PX)
 
 
 def lifts(known: Known, new_ids: set[str], matches: Iterable[PairMatch]) -> bool:

@@ -9,8 +9,8 @@ held against each of both photos drawn alone, which shows the same ground on bot
 mosaic's difference to it changes by is counted (`step`, the median over all pieces).
 
 Where two photos show different things at the same place, the crowns of trees from two sides, this still
-counts things as tone. How much tells `floor`: the same measure on the same pieces, if one photo alone were
-drawn on both sides; a map without any seam would not get below it. And two more figures are free of it:
+counts things as tone. How much tells `floor`: the same measure on the same pieces if one photo alone were
+drawn on both sides, where there is no seam at all. And two more figures are nearly free of it:
 `step_same_ground`, over those pieces where both photos show the same; `step_whole_seams`, where the steps of
 all pieces between the same two photos are averaged with their signs: exposure errs alike along a seam, things
 do not.
@@ -114,9 +114,9 @@ def measure(layout: oracle.Layout, photos: Any) -> Iterator[Piece]:
     def alone(k: int) -> tuple[int, int, NDArray[np.uint8]]:
         """What the photo shows around all of its pieces, and where that begins."""
         mine = np.array([box for box, piece in zip(boxes, found, strict=True) if k in piece[:2]])
-        y0, x0, y1, x1 = (*mine[:, :2].min(0).tolist(), *mine[:, 2:].max(0).tolist())
-        window = grid.window(grid.col0 + x0, grid.row0 + y0, x1 - x0, y1 - y0)
-        return y0, x0, render(window, layout.world, [layout.frames[ids[k]]], photos, FUSION)
+        (top, left), (bottom, right) = mine[:, :2].min(0).tolist(), mine[:, 2:].max(0).tolist()
+        window = grid.window(grid.col0 + left, grid.row0 + top, right - left, bottom - top)
+        return top, left, render(window, layout.world, [layout.frames[ids[k]]], photos, FUSION)
 
     for (low, high, at), (y0, x0, y1, x1) in zip(found, boxes, strict=True):
         singles = []

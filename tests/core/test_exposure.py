@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.exposure import balance, balanced, fitted
+from core.exposure import FEW, balance, balanced, fitted, light_apart
 from core.geometry import Camera, Pose, PosedFrame, World
 
 Rgb = NDArray[np.uint8]
@@ -214,9 +214,46 @@ def test_new_photos_suit_those_that_are_there() -> None:
     assert [f.gain for f in fitted(blank[::-1], shuffled, thumbs)] == [f.gain for f in found]
 
 
+def test_many_new_photos_are_told_from_few_known_ones() -> None:
+    """As when photos were waiting: nearly all of them see nobody whose light is known."""
+    frames, rng = sorted(flight(), key=lambda f: f.pose.center[0]), np.random.default_rng(8)
+    lights = {f.frame_id: np.exp(rng.normal(0, 0.3, 3)) for f in frames}
+    thumbs = {f.frame_id: thumb(f, lights[f.frame_id]) for f in frames}
+    known = [replace(f, gain=tuple(1 / lights[f.frame_id])) for f in frames[:4]]
+    found = fitted(frames[4:], known, thumbs)
+    assert len(found) > FEW
+    left = np.log([np.multiply(f.gain, lights[f.frame_id]) for f in found])
+    assert np.abs(left).max() < 0.06
+    shuffled = fitted([frames[k] for k in 4 + rng.permutation(len(frames) - 4)], known, thumbs)
+    assert [f.gain for f in shuffled] == [f.gain for f in found]
+
+
 def test_a_new_photo_that_overlaps_nobody_keeps_its_light() -> None:
     near, far = flight(1, 1)[0], flight(1, 1)[0]
     far = replace(far, frame_id="far", pose=replace(far.pose, center=far.pose.center + 500.0))
     thumbs = {f.frame_id: thumb(f, np.full(3, 0.7)) for f in (near, far)}
     assert fitted([far], [near], thumbs)[0].gain == (1.0, 1.0, 1.0)
     assert fitted([far], [], thumbs)[0].gain == (1.0, 1.0, 1.0)
+
+
+def test_how_differently_a_frame_is_lit_is_told_from_above() -> None:
+    """No pixel's light changes by more than that, and one in a corner by about as much."""
+    rng = np.random.default_rng(9)
+    frame = flight(1, 1)[0]
+    for _ in range(5):
+        numbers = (
+            *np.multiply(FALLOFF, rng.normal(0, 0.3)),
+            *np.repeat(rng.normal(0, 0.2, 2)[None], 3, 0).ravel(),
+        )
+        other = replace(
+            frame, gain=tuple(np.exp(rng.normal(0, 0.1, 3))), camera=replace(CAMERA, falloff=numbers)
+        )
+        u, v = np.meshgrid(np.linspace(0, 1599, 30), np.linspace(0, 1199, 30))
+        uv = np.column_stack((u.ravel(), v.ravel()))
+        ray = frame.pose.ground(CAMERA, uv) - frame.pose.center
+        rho2 = 4 * ((uv - (CAMERA.cx, CAMERA.cy)) ** 2).sum(1) / (CAMERA.width**2 + CAMERA.height**2)
+        lens = np.column_stack((rho2, rho2**2, rho2**3)) @ np.reshape(numbers[:9], (3, 3)).T
+        side = (ray / np.linalg.norm(ray, axis=1)[:, None])[:, :2] @ np.reshape(numbers[9:], (3, 2)).T
+        truth = np.abs(np.log(other.gain) - lens - side).max()
+        assert 0.4 * light_apart(frame, other) < truth < 1.2 * light_apart(frame, other)
+    assert light_apart(frame, frame) == 0
