@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from io import BytesIO
 from typing import Literal
 
@@ -53,15 +54,52 @@ def decode_rgb(data: bytes, max_side: int | None = None) -> Pixels:
     return _fit(picture, scaled_size(picture.shape[1], picture.shape[0], max_side))
 
 
-def decode_to_draw(data: bytes, max_side: int | None = None) -> Pixels:
-    """As `decode_rgb`, but up to `MILD_SHRINK` times as large.
+def decode_to_draw(
+    data: bytes, max_side: int | None = None, rows_of: Callable[[int, int], int] | None = None
+) -> tuple[Pixels, int]:
+    """As `decode_rgb`, but up to `MILD_SHRINK` times as large, perhaps its upper part only; the whole height.
 
-    Whoever samples a photo anyway need not have it sampled before.
+    Whoever samples a photo anyway need not have it sampled before. `rows_of`: how many rows are needed of a
+    photo so wide and high; a JPEG is not decoded farther down than that.
     """
     if not data.startswith(_JPEG_MAGIC):
-        return decode_rgb(data, max_side)
-    picture, size = _decode_jpeg(data, max_side, "RGB"), _jpeg_target(data, max_side)
-    return picture if picture.shape[1] < MILD_SHRINK * size[0] else _fit(picture, size)
+        picture = decode_rgb(data, max_side)
+        return picture, len(picture)
+    width, height, stored = _jpeg_header(data)
+    target = scaled_size(width, height, max_side)
+    factor = _dct_factor(width, height, target)
+    if stored != "YCbCr" or width >= factor * MILD_SHRINK * target[0]:
+        picture = _fit(_decode_jpeg(data, max_side, "RGB"), target)
+        return picture, len(picture)
+    if rows_of is not None:
+        rows = factor * rows_of(width // factor, height // factor) + _ROWS_BEYOND
+        if rows < height and (part := _decode_top(data, rows // 16 * 16, width, factor)) is not None:
+            return part, height // factor
+    return _decode_jpeg(data, max_side, "RGB"), height // factor
+
+
+_ROWS_BEYOND = 48
+"""Colours are spread over the rows around them: the last rows of a part are not those of the whole."""
+
+
+def _decode_top(data: bytes, rows: int, width: int, factor: int) -> Pixels | None:
+    """The first rows of a JPEG, which is told to be no higher; None where that cannot be."""
+    at = 2
+    while (marker := data[at : at + 2]) not in (b"\xff\xc0", b"\xff\xc1"):
+        known = marker[:1] == b"\xff" and (
+            marker[1:] in b"\xc4\xdb\xdd\xfe" or b"\xe0" <= marker[1:] <= b"\xef"
+        )
+        if not known:
+            return None  # not sequential: what belongs to the first rows is all over the file
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    lower = data[: at + 5] + rows.to_bytes(2, "big") + data[at + 7 :]
+    size = {"min_width": width // factor, "min_height": rows // factor} if factor > 1 else {}
+    try:
+        # Not strict: what follows those rows is noticed.
+        pixels = np.asarray(simplejpeg.decode_jpeg(lower, "RGB", strict=False, **size), np.uint8)
+    except ValueError:
+        return None
+    return pixels if pixels.shape[:2] == (rows // factor, width // factor) else None
 
 
 def decode_gray(data: bytes, max_side: int | None = None) -> Pixels:

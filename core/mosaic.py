@@ -154,7 +154,7 @@ class _Photos:
 
     def photo(self, frame_id: str) -> Pixels:
         if frame_id not in self._decoded:
-            self._decoded[frame_id] = decode_to_draw(self._read[frame_id].data, self._max_side)
+            self._decoded[frame_id] = decode_to_draw(self._read[frame_id].data, self._max_side)[0]
         return self._decoded[frame_id]
 
     def thumb(self, frame_id: str) -> Pixels:

@@ -129,9 +129,12 @@ class PhotoShelf:
         key = photo_key(mission_id, frame_id)
 
         def load() -> tuple[Part, int]:
-            whole = Part.whole(decode_to_draw(self.store.get(key), max_side))
-            size = (whole.width, whole.height)
-            part = whole.cut(window_of(*size).joined(likely(frame_id).window(*size)))
+            def kept(width: int, height: int) -> Window:
+                return window_of(width, height).joined(likely(frame_id).window(width, height))
+
+            pixels, height = decode_to_draw(self.store.get(key), max_side, lambda *size: kept(*size).bottom)
+            width = pixels.shape[1]
+            part = Part(pixels, 0, 0, width, height).cut(kept(width, height))
             return part, part.pixels.nbytes
 
         part: Part = self.pictures.get((key, max_side), load)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import simplejpeg
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from core.decode import decode_to_draw
 from core.fusion import FrameIndex, FusionParams, Territory, render
 from core.geometry import Camera, Pose, PosedFrame, World
 from core.grid import MercatorGrid
@@ -93,3 +95,26 @@ def test_what_a_photo_will_show_is_guessed_from_who_else_is_there() -> None:
     corner = among.share("20")  # the north-western one: nobody else shows what lies north and west of it
     assert corner.left == corner.top == 0.0
     assert corner.right < 1.0
+
+
+@pytest.mark.parametrize("sampling", ["444", "422", "420", "440", "Gray"])
+@pytest.mark.parametrize(("size", "max_side"), [((320, 480), None), ((397, 531), 500), ((640, 960), 400)])
+def test_the_top_of_a_photo_is_decoded_alone(
+    sampling: str, size: tuple[int, int], max_side: int | None
+) -> None:
+    grey = np.random.default_rng(1).integers(0, 256, (size[0] // 4 + 1, size[1] // 4 + 1, 3)).astype(np.uint8)
+    picture = np.ascontiguousarray(grey.repeat(4, 0).repeat(4, 1)[: size[0], : size[1]])
+    if sampling == "Gray":
+        data = simplejpeg.encode_jpeg(picture[..., :1].copy(), 90, "GRAY", "Gray")
+    else:
+        data = simplejpeg.encode_jpeg(picture, 90, "RGB", sampling)
+    whole, height = decode_to_draw(data, max_side)
+    assert len(whole) == height
+    shorter = 0
+    for share in (0.1, 0.5, 0.8, 1.0):
+        top, told = decode_to_draw(data, max_side, lambda _, rows, share=share: int(share * rows))
+        assert told == height
+        rows = int(share * height)
+        assert np.array_equal(top[:rows], whole[:rows])
+        shorter += len(top) < height
+    assert shorter or sampling == "Gray"
