@@ -101,10 +101,20 @@ class Sender:
             return False
         return True
 
+    def prepare(self) -> None:
+        """Load now what the first send would have to; nothing is sent, and no broker is needed."""
+        app = self._app
+        _ = app.amqp.queues, app.backend, app.connection_for_write().get_transport_cls()
+
 
 @lru_cache(maxsize=1)
 def _sender() -> Sender:
     return Sender(get_settings())
+
+
+def prepare() -> None:
+    """Spend on starting what the first `send` of this process would take: 0.1 s."""
+    _sender().prepare()
 
 
 def send(name: str, *args: Any, priority: int | None = None) -> bool:

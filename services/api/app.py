@@ -80,6 +80,8 @@ async def _lifespan(settings: Settings, send: Send, app: FastAPI) -> AsyncIterat
     app.state.services = Services(settings, db, store, send, feed, uploads, asyncio.Semaphore(ACCEPT_AT_ONCE))
     sweep = Sweep(settings, db, store, send, uploads)
     sweep.start()
+    if send is queue.send:
+        await asyncio.to_thread(queue.prepare)
     try:
         yield
     finally:
