@@ -139,8 +139,8 @@ class MosaicPlan:
         place = {"transform": self._to_crs(level) @ rasterio.Affine.translation(*box[:2])}
         size = {"width": box[2], "height": box[3], "count": 4, "dtype": "uint8"}
         blocks = {"tiled": True, "blockxsize": self.params.block_px, "blockysize": self.params.block_px}
-        # Zstandard packs as well as deflate in half the time; GDAL alone will read it.
-        packing = {"compress": "zstd", "zstd_level": 1, "predictor": 2}
+        # Only GDAL will read it: Zstandard is faster than deflate, and bands apart than together.
+        packing = {"compress": "zstd", "zstd_level": 1, "predictor": 2, "interleave": "band"}
         return kind | place | size | blocks | packing
 
     def assemble(self, folder: Path, path: Path, crs: str | None = None) -> None:
