@@ -139,10 +139,17 @@ def keys_of(tx: Session, mission_id: str, frame_ids: Collection[str]) -> Sequenc
 def accepted(tx: Session, mission_id: str, touching: Collection[str] | None = None) -> Sequence[bytes]:
     """The matches of the accepted pairs, sorted by (low, high); `touching`: only those of these frames."""
     if touching is None:
-        return _accepted(tx, mission_id, None)
+        return _accepted(tx, mission_id)
     found: dict[Key, bytes] = {}
     for some in chunks(sorted(touching)):
-        found |= dict(_accepted_rows(tx, mission_id, some))
+        for mine in (
+            Pair.low,
+            Pair.high,
+        ):  # by frame alone, as in `verdicts`; what was refused has no matches
+            query = select(Pair.low, Pair.high, Pair.matches).where(
+                Pair.mission_id == mission_id, mine.in_(some)
+            )
+            found |= {(low, high): m for low, high, m in tx.execute(query) if m is not None}
     return [found[key] for key in sorted(found)]
 
 
@@ -173,12 +180,15 @@ def list(
 def verdicts(tx: Session, mission_id: str, keys: Collection[Key]) -> Mapping[Key, bool]:
     """Those of these pairs that are computed, and whether each was accepted."""
     found: dict[Key, bool] = {}
-    for some in chunks(sorted(keys)):
-        query = select(Pair.low, Pair.high, Pair.accepted).where(
-            Pair.mission_id == mission_id, Pair.state == "done", tuple_(Pair.low, Pair.high).in_(some)
+    wanted = set(keys)
+    for some in chunks(sorted({low for low, _ in wanted})):
+        # By frame alone: a condition on the state would have all computed pairs of the mission read.
+        query = select(Pair.low, Pair.high, Pair.state, Pair.accepted).where(
+            Pair.mission_id == mission_id, Pair.low.in_(some)
         )
-        found |= {(low, high): good for low, high, good in tx.execute(query)}
-    return found
+        rows = tx.execute(query)
+        found |= {(low, high): good for low, high, state, good in rows if state == "done"}
+    return {key: found[key] for key in sorted(found.keys() & wanted)}
 
 
 def summary(tx: Session, mission_id: str) -> PairSummary:
@@ -199,18 +209,10 @@ def summary(tx: Session, mission_id: str) -> PairSummary:
     return PairSummary(total, done, good, dict(sorted(reasons.items())))
 
 
-def _accepted(tx: Session, mission_id: str, touching: Sequence[str] | None) -> Sequence[bytes]:
-    return [matches for _, matches in _accepted_rows(tx, mission_id, touching)]
-
-
-def _accepted_rows(
-    tx: Session, mission_id: str, touching: Sequence[str] | None
-) -> Iterable[tuple[Key, bytes]]:
+def _accepted(tx: Session, mission_id: str) -> Sequence[bytes]:
     query = (
-        select(Pair.low, Pair.high, Pair.matches)
+        select(Pair.matches)
         .where(Pair.mission_id == mission_id, Pair.state == "done", Pair.accepted.is_(True))
         .order_by(Pair.low, Pair.high)
     )
-    if touching is not None:
-        query = query.where(or_(Pair.low.in_(touching), Pair.high.in_(touching)))
-    return [((low, high), matches) for low, high, matches in tx.execute(query) if matches is not None]
+    return [matches for matches in tx.scalars(query) if matches is not None]
