@@ -123,7 +123,7 @@ def measure(layout: oracle.Layout, photos: Any) -> Iterator[Piece]:
         for top, left, picture in (alone(low), alone(high)):
             singles.append(picture[y0 - top : y1 - top, x0 - left : x1 - left].astype(np.float32))
         part = np.s_[y0:y1, x0:x1]
-        piece = _piece(low, high, at - (y0, x0), sources[part], drawn[part].astype(np.float32), singles)
+        piece = piece_of(low, high, at - (y0, x0), sources[part], drawn[part].astype(np.float32), singles)
         if piece is not None:
             yield piece
 
@@ -133,7 +133,7 @@ def _box(at: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[int, int, int, 
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
-def _piece(
+def piece_of(
     low: int, high: int, at: NDArray[np.int64], whose: Sources, picture: Picture, singles: list[Picture]
 ) -> Piece | None:
     away = np.ones(whose.shape, np.uint8)
@@ -154,8 +154,8 @@ def _piece(
     return Piece(low, high, len(at), step, abs(floor), float(np.corrcoef(*grey)[0, 1]))
 
 
-def line_of(found: list[Piece]) -> dict[str, float]:
-    """The medians, in grey levels."""
+def line_of(found: list[Piece]) -> dict[str, float | None]:
+    """The medians, in grey levels; None where there is nothing to take one of."""
     same = [p for p in found if p.alike > SAME_GROUND]
     seams: dict[tuple[int, int], list[Piece]] = {}
     for p in found:
@@ -173,8 +173,8 @@ def line_of(found: list[Piece]) -> dict[str, float]:
     }
 
 
-def _median(values: Sequence[float]) -> float:
-    return round(float(np.median(np.abs(values))), 2)
+def _median(values: Sequence[float]) -> float | None:
+    return round(float(np.median(np.abs(values))), 2) if values else None
 
 
 def main() -> None:
