@@ -142,14 +142,12 @@ def accepted(tx: Session, mission_id: str, touching: Collection[str] | None = No
         return _accepted(tx, mission_id)
     found: dict[Key, bytes] = {}
     for some in chunks(sorted(touching)):
-        for mine in (
-            Pair.low,
-            Pair.high,
-        ):  # by frame alone, as in `verdicts`; what was refused has no matches
-            query = select(Pair.low, Pair.high, Pair.matches).where(
+        for mine in (Pair.low, Pair.high):  # by frame alone, as in `verdicts`
+            query = select(Pair.low, Pair.high, Pair.accepted, Pair.matches).where(
                 Pair.mission_id == mission_id, mine.in_(some)
             )
-            found |= {(low, high): m for low, high, m in tx.execute(query) if m is not None}
+            rows = tx.execute(query)
+            found |= {(low, high): m for low, high, good, m in rows if good and m is not None}
     return [found[key] for key in sorted(found)]
 
 
