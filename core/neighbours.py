@@ -160,10 +160,12 @@ def _in_appearance(
 ) -> Iterable[tuple[int, list[int]]]:
     if len(ordered) < 2:
         return
-    words = peculiar(np.stack([f.words for f in ordered]))
+    words = np.stack([f.words for f in ordered])
+    apart = peculiar(words) if len(of) > 1 else None
     for block in (of[k : k + 256] for k in range(0, len(of), 256)):
         # Rounded, so that the last bits of a product do not decide between twins: the earlier one wins.
-        similarity = np.round(words[block] @ words.T / _SIMILARITY_STEP)
+        product = apart[block] @ apart.T if apart is not None else _alike_one(words, block[0])[None]
+        similarity = np.round(product / _SIMILARITY_STEP)
         similarity[np.arange(len(block)), block] = -np.inf
         for i, row in zip(block, similarity, strict=True):
             count = params.alike if ordered[i].gps is not None else params.alike_without_gps
@@ -176,6 +178,17 @@ def _highest(row: NDArray[np.float32], count: int) -> list[int]:
         return []
     enough = np.flatnonzero(row >= np.partition(row, -count)[-count])
     return [int(j) for j in enough[np.argsort(-row[enough], kind="stable")][:count]]
+
+
+def _alike_one(words: NDArray[np.float32], i: int) -> NDArray[np.float32]:
+    """One row of the products of `peculiar` words with each other (N,), without working out all of them."""
+    mean = np.full(len(words), 1 / len(words), np.float32) @ words
+    mine = words[i] - mean
+    # (a − m)·(b − m) and |a − m|² without a copy of all words
+    to_mine, to_mean = (words @ np.column_stack((mine, mean))).T
+    length2 = np.einsum("ij,ij->i", words, words) - 2 * to_mean + mean @ mean
+    apart = np.sqrt(np.maximum(length2, 1e-12) * max(float(mine @ mine), 1e-12))
+    return np.asarray((to_mine - mean @ mine) / apart, np.float32)
 
 
 def peculiar(words: NDArray[np.float32]) -> NDArray[np.float32]:

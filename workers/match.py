@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 from sqlalchemy.orm import Session
 
@@ -17,7 +17,7 @@ from services.queue import send
 from workers.app import Stopwatch, db, settings, stage
 from workers.photos import shelf
 
-LIVE = NeighbourParams(nearest=4, sectors=4, before_and_after=1, alike=2)
+LIVE = NeighbourParams(nearest=3, sectors=4, before_and_after=1, alike=1)
 """While photos come in, a few neighbours each hold them; the final solve asks for the pairs that it wants.
 
 Who is near changes with every photo: what more is asked for now, nobody may want in the end.
@@ -25,7 +25,16 @@ Who is near changes with every photo: what more is asked for now, nobody may wan
 CALM_S = 0.5
 _REMEMBERED = 8
 
-_seen: OrderedDict[str, dict[str, Seen]] = OrderedDict()
+
+@dataclass(frozen=True, slots=True)
+class _Mission:
+    """What this process knows of one: its mode, which never changes, and the frames that were read."""
+
+    mode: str
+    seen: Mapping[str, Seen]
+
+
+_known: OrderedDict[str, _Mission] = OrderedDict()
 
 
 @stage("match")
@@ -33,13 +42,13 @@ def match(mission_id: str, frame_id: str | None, wanted: Sequence[Key] = ()) -> 
     """From ready to matched; without a frame id, the `wanted` pairs for the final solve."""
     clock = Stopwatch()
     with db.read() as tx:
-        mode = missions.get(tx, mission_id).mode
-        seen = _look(tx, mission_id)
+        mission = _look(tx, mission_id)
+    seen = mission.seen
     if frame_id is not None:
         if frame_id not in seen or seen[frame_id].state != "ready":
             send("sequence", mission_id)
             return
-        wanted = neighbours(mission_id, seen, frame_id) if mode == "visual" else []
+        wanted = neighbours(mission_id, seen, frame_id) if mission.mode == "visual" else []
     with db.write(durable=False) as tx:
         mine = pairs.claim(tx, mission_id, frame_id, [(a, b) for a, b in wanted])
     results = [computed(mission_id, seen, pair) for pair in mine]
@@ -53,13 +62,16 @@ def match(mission_id: str, frame_id: str | None, wanted: Sequence[Key] = ()) -> 
         send("sequence", mission_id)
 
 
-def _look(tx: Session, mission_id: str) -> dict[str, Seen]:
+def _look(tx: Session, mission_id: str) -> _Mission:
     """The frames that were read; of those that this process knows only the states are fetched."""
-    known = _seen.pop(mission_id, {})
-    while len(_seen) >= _REMEMBERED:
-        _seen.popitem(last=False)
-    _seen[mission_id] = seen = {s.frame_id: s for s in frames.sightings(tx, mission_id, known)}
-    return seen
+    known = _known.pop(mission_id, None)
+    if known is None:
+        known = _Mission(missions.get(tx, mission_id).mode, {})
+    while len(_known) >= _REMEMBERED:
+        _known.popitem(last=False)
+    seen = {s.frame_id: s for s in frames.sightings(tx, mission_id, known.seen)}
+    _known[mission_id] = found = _Mission(known.mode, seen)
+    return found
 
 
 def sighting(mission_id: str, seen: Seen) -> Sighting:
