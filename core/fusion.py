@@ -34,7 +34,7 @@ from core.parts import Photos as Photos
 from core.parts import Share, likely
 from core.seams import REACH_CELLS, settle
 from core.sharpness import give_way
-from core.tone import relit
+from core.tone import Gain, relit
 from core.warp import Int32, Lattice, Rgb, Views, look
 
 PAD_CELLS = 2
@@ -169,17 +169,15 @@ def render(
     `frames`: at least those of `overlapping`; their order does not matter. Pure: equal input, equal bytes.
     `only`: (height / cell, width / cell) of a grid of whole cells: what is drawn; elsewhere anything may be.
     """
-    out = np.zeros((grid.height, grid.width, 4), np.uint8)
     frames = sorted(frames, key=lambda f: f.frame_id)
     wide = Lattice.covering(grid, world, params.cell_px, PAD_CELLS + params.rim_cells)
     scene = _Scene.of(wide, grid.resolution_m(world), frames, photos, params, _kept(only))
     if scene is None:
-        return out
+        return np.zeros((grid.height, grid.width, 4), np.uint8)
     lattice = wide.inner(params.rim_cells)
     drawn = _draw(scene, lattice, grid.resolution_m(world), photos, params)
     top, left = grid.row0 - lattice.row0, grid.col0 - lattice.col0
-    out[:] = drawn[top : top + grid.height, left : left + grid.width]
-    return out
+    return drawn[top : top + grid.height, left : left + grid.width].copy()
 
 
 def _kept(only: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -256,10 +254,27 @@ def _look(
     gsd_m = abs(frame.pose.gsd_m(frame.camera))
     importance = _importance(frame, resolution_m, params)
     skirt_px = SKIRT_CELLS * params.cell_px * resolution_m / gsd_m
-    thumb = relit(photos.thumb(frame.frame_id), frame.gain)
-    tone = _shrunk(np.ascontiguousarray(thumb[..., :3]), params.tone_side_px)
-    tones = (thumb, tone, _shrunk(tone, params.tone_side_px // 4))
+    tones = _toned(frame, photos.thumb(frame.frame_id), params.tone_side_px)
     look(lattice, frame, tones, importance, params.min_cos_view, skirt_px, views, k)
+
+
+_toned_last: dict[tuple[str, Gain, int], tuple[Rgb, tuple[Rgb, Rgb, Rgb]]] = {}
+TONED = 128
+"""So many photos' tones are kept: neighbouring rasters ask for the same ones again and again."""
+
+
+def _toned(frame: PosedFrame, thumb: Rgb, side_px: int) -> tuple[Rgb, Rgb, Rgb]:
+    """A thumbnail as its photo will be drawn, and how it looks from afar and from farther still."""
+    key = (frame.frame_id, frame.gain, side_px)
+    of, tones = _toned_last.get(key, (None, None))
+    if tones is None or of is not thumb:
+        drawn = relit(thumb, frame.gain)
+        tone = _shrunk(np.ascontiguousarray(drawn[..., :3]), side_px)
+        tones = (drawn, tone, _shrunk(tone, side_px // 4))
+        for oldest in list(_toned_last)[: 1 - TONED]:
+            _toned_last.pop(oldest, None)
+        _toned_last[key] = (thumb, tones)
+    return tones
 
 
 def _shrunk(image: Rgb, side_px: int) -> Rgb:
@@ -285,11 +300,10 @@ def _blend(
 ) -> NDArray[np.uint8]:
     labels, colours = scene.labels, scene.retone.copy()
     for layer in layers:
-        mine = scene.labels == layer.label
         mean = layer.levels[-1]
-        window = np.zeros((*labels.shape, 3), np.float32)
-        window[layer.row :, layer.col :][: mean.shape[0], : mean.shape[1]] = mean
-        colours[mine] += window[mine]
+        part = np.s_[layer.row : layer.row + mean.shape[0], layer.col : layer.col + mean.shape[1]]
+        mine = scene.labels[part] == layer.label
+        colours[part][mine] += mean[mine]
     for level in range(params.bands - 1, 0, -1):
         finer = label_level(scene.labels, scene.weights, params.cell_px >> level, None, sizes)
         colours = blend_level(colours, labels, layers, level, finer, params.cell_px)
