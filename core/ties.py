@@ -128,7 +128,9 @@ def live_ties(
     """
     params = params or LIVE
     seeking = {k for k in seekers if k in homes and k in gallery.row_of}
-    near = {k for k in gallery.within(seeking, params.reach_m) if k in homes}
+    own = {homes[k] for k in seeking}
+    others = (k for k in gallery.within(seeking, params.reach_m) if k in homes)
+    near = seeking | {k for k in others if len(own) > 1 or homes[k] not in own}
     label = {home: k for k, home in enumerate(sorted({homes[k] for k in near}, key=str))}
     if len(label) < 2:
         return []
