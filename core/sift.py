@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.blurring import blur
 from core.extrema import BORDER, extrema
 from core.gradients import SIGMA, directions, histograms
 
@@ -63,32 +64,24 @@ class Described:
 
 
 def scale_space(gray: NDArray[np.uint8], layers: int) -> ScaleSpace:
-    """Octaves of a picture (H, W), down to about ten pixels."""
+    """Octaves of a picture (H, W), down to about ten pixels; `layers`: 3 at least."""
     size = (2 * gray.shape[1], 2 * gray.shape[0])
     first = np.asarray(cv2.resize(gray.astype(np.float32), size), np.float32)
-    _blur(first, SIGMA**2 - (2 * CAMERA_BLUR) ** 2, first)
+    variance = SIGMA**2 * 4 ** (np.arange(layers + 3) / layers)
+    rise = np.sqrt(np.diff(variance))
     octaves: list[Floats] = []
-    while min(first.shape) > 2 * BORDER + 2:
-        octaves.append(_octave(first, layers))
-        first = octaves[-1][layers, ::2, ::2]
+    shape = first.shape
+    while min(shape) > 2 * BORDER + 2:
+        stack = np.empty((layers + 3, *shape), np.float32)
+        if octaves:
+            stack[0] = octaves[-1][layers, ::2, ::2]
+        else:
+            blur(first, math.sqrt(variance[0] - (2 * CAMERA_BLUR) ** 2), stack[0])
+        for k, sigma in enumerate(rise):
+            blur(stack[k], sigma, stack[k + 1])
+        octaves.append(stack)
+        shape = ((shape[0] + 1) // 2, (shape[1] + 1) // 2)
     return ScaleSpace(tuple(octaves), layers)
-
-
-def _octave(first: Floats, layers: int) -> Floats:
-    """(layers + 3, h, w): `first` and its successors."""
-    stack = np.empty((layers + 3, *first.shape), np.float32)
-    stack[0] = first
-    variance = [SIGMA**2 * 4 ** (k / layers) for k in range(layers + 3)]
-    for k in range(1, layers + 3):
-        _blur(stack[k - 1], variance[k] - variance[k - 1], stack[k])
-    return stack
-
-
-def _blur(picture: Floats, variance: float, out: Floats) -> None:
-    sigma = math.sqrt(variance)
-    # Beyond three sigmas lies a quarter of a percent.
-    side = 2 * math.ceil(3 * sigma) + 1
-    cv2.GaussianBlur(picture, (side, side), sigma, dst=out)
 
 
 def find_spots(space: ScaleSpace, contrast: float) -> Spots:
