@@ -270,7 +270,7 @@ def _toned(frame: PosedFrame, thumb: Rgb, side_px: int) -> tuple[Rgb, Rgb, Rgb]:
     if tones is None or of is not thumb:
         drawn = relit(thumb, frame.gain)
         tone = _shrunk(np.ascontiguousarray(drawn[..., :3]), side_px)
-        tones = (drawn, tone, _shrunk(tone, side_px // 4))
+        tones = (drawn, tone, _shrunk(tone, side_px // 8))
         for oldest in list(_toned_last)[: 1 - TONED]:
             _toned_last.pop(oldest, None)
         _toned_last[key] = (thumb, tones)
