@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from core.coverage import draw_block, mission_zoom, tiles_under
+from core.coverage import draw_block, mission_zoom, quarter, tiles_under
 from core.exposure import balanced
 from core.features import FeatureParams, Features, extract
 from core.frame import Attitude, FrameMeta, GpsFix
 from core.fusion import FrameIndex
 from core.geometry import Array, Camera, Pose, PosedFrame, World
+from core.grid import TILE_PX
 from core.matching import MatchCounts, MatchParams, PairMatch, match_pair
-from core.pyramid import Rgba, halve
+from core.pyramid import Rgba, encode
 from core.shrink import shrunk_by_area
 
 HEIGHT_M, STEP_M, SIDE_PX = 60.0, 12.0, 256
@@ -76,7 +77,15 @@ def rendering() -> None:
     assert zoom is not None
     tiles = sorted(tiles_under(frames[0], WORLD, zoom))
     draw_block(tiles[:2], WORLD, FrameIndex(frames), photos)
-    halve(np.zeros((2, 2, 4), np.uint8))
+    border = encode(_border_tile())
+    assert border is not None
+    quarter(border[0])
+
+
+def _border_tile() -> Rgba:
+    rgba = np.full((TILE_PX, TILE_PX, 4), 200, np.uint8)
+    rgba[TILE_PX // 2 :] = 0
+    return rgba
 
 
 def solving() -> None:
