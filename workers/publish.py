@@ -21,7 +21,7 @@ ENOUGH, ENOUGH_LIVE = 128, 24
 """Tiles that are worth a revision of their own while others are still drawn: every revision has its price,
 the overviews up to the top.
 """
-LAST_TILES = 8
+LAST_TILES = 12
 """So many a worker are still drawn when the last but one revision is published."""
 
 
@@ -67,7 +67,7 @@ def _worth_it(rendered: int, more: int, final: bool) -> bool:
     if not final:
         return rendered >= ENOUGH_LIVE
     few = LAST_TILES * settings.workers
-    return rendered >= ENOUGH or (more <= few and rendered >= 2 * few)
+    return rendered >= ENOUGH or more <= few <= rendered
 
 
 @contextmanager

@@ -63,9 +63,9 @@ def test_the_last_revision_is_a_small_one(bench: Any, monkeypatch: pytest.Monkey
     few = publish.LAST_TILES * workers
     assert not publish._worth_it(publish.ENOUGH - 1, 10 * few, final=True)
     assert publish._worth_it(publish.ENOUGH, 10 * few, final=True)
-    assert publish._worth_it(2 * few, few, final=True)
-    assert not publish._worth_it(2 * few, few + 1, final=True)
-    assert not publish._worth_it(few, 1, final=True)  # the last one may as well show these too
+    assert publish._worth_it(few, few, final=True)
+    assert not publish._worth_it(few, few + 1, final=True)
+    assert not publish._worth_it(few - 1, 1, final=True)  # the last one may as well show these too
 
 
 def test_who_finds_another_publishing_wakes_nobody(bench: Any, photos: list[tuple[str, bytes]]) -> None:
