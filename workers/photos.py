@@ -53,6 +53,11 @@ class BytesLru:
         self._held.clear()
         self.held_bytes = 0
 
+    @property
+    def room_bytes(self) -> int:
+        """How much more there is room for without letting go of anything."""
+        return max(0, self._limit_bytes - self.held_bytes)
+
     def forget(self, key: Hashable) -> None:
         """Lets go of one value."""
         self.held_bytes -= self._held.pop(key, (None, 0))[1]
@@ -124,12 +129,14 @@ class PhotoShelf:
     ) -> Part:
         """A part of a photo, at the mission's resolution, that holds the window. Raises ObjectNotFound.
 
-        `likely`: what more is kept of it.
+        `likely`: what more is kept of it; all of it, while there is room.
         """
         key = photo_key(mission_id, frame_id)
 
         def load() -> tuple[Part, int]:
             def kept(width: int, height: int) -> Window:
+                if 3 * width * height <= self.pictures.room_bytes:
+                    return Window(0, 0, width, height)
                 return window_of(width, height).joined(likely(frame_id).window(width, height))
 
             pixels, height = decode_to_draw(self.store.get(key), max_side, lambda *size: kept(*size).bottom)

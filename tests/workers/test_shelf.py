@@ -126,7 +126,7 @@ def test_a_photo_of_which_too_little_was_kept_is_decoded_again() -> None:
     from core.parts import Share, Window
     from workers.photos import MissionPhotos, PhotoShelf
 
-    shelf = PhotoShelf.of(_Album(), 4_000_000)
+    shelf = PhotoShelf.of(_Album(), 40_000)  # too small for one whole photo
     mission = MissionPhotos(shelf, "m", None, lambda frame_id: Share(0.25, 0.25, 0.5, 0.5))
     whole = MissionPhotos(PhotoShelf.of(_Album(), 4_000_000), "m", None).photo("1")
     for asked, held in (
