@@ -259,7 +259,7 @@ def _look(
 
 
 _toned_last: dict[tuple[str, Gain, int], tuple[Rgb, tuple[Rgb, Rgb, Rgb]]] = {}
-TONED = 128
+TONED = 96
 """So many photos' tones are kept: neighbouring rasters ask for the same ones again and again."""
 
 
