@@ -46,7 +46,7 @@ class MosaicParams:
     block_px: int = 512
     deflate_level: int = 1
     max_pixels: int = 20_000_000_000
-    cache_mb: int = 64
+    cache_mb: int = 32
     threads: int = 1
 
 
