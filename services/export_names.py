@@ -12,6 +12,9 @@ from core.errors import BadCrs
 
 MOSAIC = "mosaic.tif"
 
+MAKING = "making-"
+"""Begins the names of the folders in which they are made."""
+
 ExportName = Literal[
     "mosaic.tif",
     "preview.png",

@@ -86,6 +86,11 @@ class Settings(BaseSettings):
         return PhotoLimits(max_bytes=self.max_upload_bytes, max_pixels=self.max_pixels)
 
     @property
+    def exports_dir(self) -> Path:
+        """Where files are while they are made; the names there begin with a mission's id, or `MAKING`."""
+        return self.data_dir / "exports"
+
+    @property
     def database_embedded(self) -> bool:
         """Whether the database is a file of our own, so that we migrate it at start without asking."""
         return self.database_url.startswith("sqlite")

@@ -21,6 +21,7 @@ _PART = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]*")
 _LONGEST_KEY, _LONGEST_PART = 900, 200
 _TEMP = ".tmp"  # no key can begin with a dot
 _TEMP_LIFETIME_S = 3600.0
+_MOVES = 100  # who deletes folders all the while loses sooner or later
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -196,15 +197,16 @@ class FolderStore:
             raise OutOfDisk()
 
     def _move(self, temp: Path, path: Path) -> None:
-        for attempt in range(10):
+        for attempt in range(_MOVES):
             try:
                 os.replace(temp, path)
                 break
             except FileNotFoundError:  # a new folder, or delete_prefix took it away
-                if attempt == 9:
+                if attempt == _MOVES - 1 or not temp.exists():
                     raise
                 self._durable.difference_update(_missing(path.parent, self.root))
-                path.parent.mkdir(parents=True, exist_ok=True)
+                with suppress(FileNotFoundError, FileExistsError):  # it takes away what is being made, too
+                    path.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):  # it took the object away as well: nothing is left to keep
             self._sync_names(path.parent)
 

@@ -31,7 +31,7 @@ from core.superoverlay import write_kmz
 from services.catalog import exports, frames, missions, poses, surveys, tiles
 from services.catalog.frames import Seen
 from services.catalog.poses import Poses
-from services.export_names import MOSAIC, crs_of
+from services.export_names import MAKING, MOSAIC, crs_of
 from services.queue import send
 from services.report import report
 from services.tables import Export, Mission
@@ -52,7 +52,7 @@ MEDIA_TYPES = {
     ".kmz": "application/vnd.google-earth.kmz",
 }
 
-FOLDER = settings.data_dir / "exports"
+FOLDER = settings.exports_dir
 """Where files are while they are made."""
 
 Maker = Callable[[Path, Mission, Export], None]
@@ -104,7 +104,7 @@ def _made(mission: Mission, wanted: Export) -> tuple[str, int]:
     make = _mosaic if _is_mosaic(wanted.name) else MAKERS.get(wanted.name)
     if make is None:
         raise OrthostreamError(f"{wanted.name} cannot be made by this version.")
-    with TemporaryDirectory(dir=FOLDER, prefix="making-") as folder:
+    with TemporaryDirectory(dir=FOLDER, prefix=MAKING) as folder:
         path = Path(folder) / wanted.name
         make(path, mission, wanted)
         key = f"missions/{mission.id}/exports/{wanted.revision}-{wanted.generation}/{wanted.name}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import structlog
 
 from services.catalog import missions, standstill
 from services.database import Database
+from services.export_names import MAKING
 from services.settings import Settings
 from services.storage import ObjectStore
 
@@ -51,6 +53,8 @@ class Sweep:
             deleted = missions.deleting(tx)
         for mission_id in deleted:
             self._store.delete_prefix(f"missions/{mission_id}/")
+            for path in self._settings.exports_dir.glob(f"{mission_id}-*"):
+                _remove(path)
             with self._db.write() as tx:
                 missions.purge(tx, mission_id)
         self._remove_leftovers()
@@ -66,9 +70,17 @@ class Sweep:
             self._stop.wait(self._settings.sweep_s)
 
     def _remove_leftovers(self) -> None:
-        """Uploads of a process that was killed: nobody receives a photo for hours."""
+        """Uploads and exports of a process that was killed: nobody makes one for hours."""
         oldest = time.time() - _LEFTOVER_S
-        for path in self._uploads.glob("upload-*"):
+        exports = self._settings.exports_dir.glob(f"{MAKING}*")
+        for path in [*self._uploads.glob("upload-*"), *exports]:
             with suppress(FileNotFoundError):
                 if path.stat().st_mtime < oldest:
-                    path.unlink()
+                    _remove(path)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

@@ -85,6 +85,9 @@ def test_the_sweep_removes_what_was_deleted_and_wakes_what_stood_still(
     other = api.post("/api/v1/missions", json={}).json()["id"]
     services.store.put(f"missions/{other}/photos/{'a' * 32}", b"photo")
     api.delete(f"/api/v1/missions/{other}")
+    pieces = services.settings.exports_dir / f"{other}-mosaic.tif.0"  # of a worker that was killed
+    pieces.mkdir(parents=True)
+    (pieces / "0-0.drawn").touch()
     sent.tasks.clear()
     settings = services.settings.model_copy(update={"stalled_after_s": 0.0})
     time.sleep(0.01)
@@ -93,6 +96,7 @@ def test_the_sweep_removes_what_was_deleted_and_wakes_what_stood_still(
         ("ingest", mission_of(mission_url), *[t.name for t in _photos(services, mission_url)])
     ]
     assert not list(services.store.list(f"missions/{other}/"))
+    assert not pieces.exists()
     with services.db.read() as tx:
         assert missions.deleting(tx) == []
 
