@@ -47,7 +47,7 @@ class Settings(BaseSettings):
     max_upload_bytes: int = Field(default=200_000_000, gt=0)
     max_pixels: int = Field(default=200_000_000, gt=0)
     min_free_bytes: int = Field(default=500_000_000, ge=0)
-    photo_cache_bytes: int = Field(default=96_000_000, ge=0)
+    photo_cache_bytes: int = Field(default=80_000_000, ge=0)
     tile_cache_bytes: int = Field(default=32_000_000, ge=0)
 
     lease_ttl_s: float = Field(default=10.0, gt=0)
