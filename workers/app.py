@@ -14,8 +14,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import wraps
 from typing import Any, ParamSpec
 
@@ -95,14 +94,6 @@ class Stopwatch:
         now = time.perf_counter()
         missions.spend(tx, mission_id, name, round(now - self._started, 4))
         self._started = now
-
-
-@contextmanager
-def timed(what: str, **more: Any) -> Iterator[None]:
-    """Logs how long a block took."""
-    started = time.perf_counter()
-    yield
-    log.debug(what, ms=round(1000 * (time.perf_counter() - started), 1), **more)
 
 
 @signals.setup_logging.connect  # type: ignore[untyped-decorator]
