@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +25,29 @@ from core.outline import ground_outline
 from core.pyramid import Rgba, decode, encode, halve
 
 FUSION = FusionParams()
+USUAL_SIDE_PX, MOST_BANDS = 1600, 6
+"""Photos drawn about so large suit `FUSION`; with more bands than that, blocks would be mostly margin."""
 SPARE_ZOOMS = 2
 """The pyramid goes on so far above the zoom at which one tile shows the whole mission."""
 
 Encoded = tuple[bytes, str]
+
+
+def typical_side(frames: Iterable[PosedFrame]) -> int | None:
+    """The longest side, in pixels, of a typical photo: the median over the frames; None without any."""
+    sides = [max(f.camera.width, f.camera.height) for f in frames]
+    return int(np.median(sides)) if sides else None
+
+
+def fusion_of(photo_side: int | None, max_side: int | None) -> FusionParams:
+    """How photos of that longest side, drawn at `max_side` pixels at most, are put together.
+
+    A band more whenever they are twice as large: so cells cover about the same share of a photo, and
+    seams and tones run alike over the ground, whatever the resolution (Zhao 2020, 3.4).
+    """
+    drawn_px = min(photo_side or USUAL_SIDE_PX, max_side or photo_side or USUAL_SIDE_PX)
+    more = max(0, round(math.log2(drawn_px / USUAL_SIDE_PX)))
+    return replace(FUSION, bands=min(FUSION.bands + more, MOST_BANDS))
 
 
 def shown_gsd_m(frame: PosedFrame, max_side: int | None) -> float:

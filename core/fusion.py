@@ -85,9 +85,14 @@ class FusionParams:
         return (PAD_CELLS + SKIRT_CELLS + 1) * self.cell_px
 
     @property
+    def rim_px(self) -> int:
+        """By moving others' seams a frame may change pixels so much farther outside of it."""
+        return self.rim_cells * self.cell_px
+
+    @property
     def reach_px(self) -> int:
         """No frame changes a pixel, not even by moving others' seams, farther than this outside of it."""
-        return self.touch_px + self.rim_cells * self.cell_px
+        return self.touch_px + self.rim_px
 
 
 DEFAULT = FusionParams()

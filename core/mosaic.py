@@ -13,12 +13,20 @@ import numpy as np
 
 from core.alignment import marks_of
 from core.checkpoints import Checkpoints
-from core.coverage import FUSION, blocks, draw_block, mission_zoom, pyramid, tiles_under
+from core.coverage import (
+    blocks,
+    draw_block,
+    fusion_of,
+    mission_zoom,
+    pyramid,
+    tiles_under,
+    typical_side,
+)
 from core.decode import Pixels, decode_rgb, decode_to_draw
 from core.errors import NotPlaceable, RejectedFrame
 from core.exposure import balanced
 from core.features import FEATURE_SIDE_PX, Features, extract
-from core.fusion import FrameIndex
+from core.fusion import FrameIndex, FusionParams
 from core.geometry import Camera, Pose, PosedFrame, World
 from core.grid import TileKey
 from core.horizon import shows_sky
@@ -41,7 +49,8 @@ class Layout:
 
     `rejected`: frame id → error code of `core.errors`. `waiting`: frames without GPS that tie to nothing that
     has a place, with the pose on their island (None for one that is alone); they are kept, and drawn when a
-    photo ties them in.
+    photo ties them in. `photo_side`: the longest side of a typical photo, `max_side`: at which photos are
+    drawn at most, pixels.
     """
 
     world: World
@@ -51,6 +60,13 @@ class Layout:
     under: Mapping[str, frozenset[TileKey]]
     rejected: Mapping[str, str]
     waiting: Mapping[str, Pose | None] = field(default_factory=dict)
+    photo_side: int | None = None
+    max_side: int | None = None
+
+    @property
+    def fusion(self) -> FusionParams:
+        """How its photos are put together."""
+        return fusion_of(self.photo_side, self.max_side)
 
     @property
     def cover(self) -> set[TileKey]:
@@ -79,16 +95,21 @@ def lay_out(
     camera_keys: Mapping[str, str],
     thumb: Callable[[str], Pixels],
     max_side: int | None,
-    zoom_now: int | None = None,
+    before: Layout | None = None,
     mode: str = "visual",
 ) -> Layout:
-    """Where and how bright every posed frame is drawn. `zoom_now`: kept while it fits well enough."""
+    """Where and how bright every posed frame is drawn.
+
+    `before`: what is shown now; its zoom is kept while it fits well enough, and its typical photo.
+    """
     bare = [
         PosedFrame(k, solution.cameras[camera_keys[k]], _plain(solution.poses[k]))
         for k in sorted(solution.poses)
     ]
-    zoom = mission_zoom(bare, solution.world, max_side, zoom_now)
-    under = {f.frame_id: tiles_under(f, solution.world, zoom) if zoom is not None else set() for f in bare}
+    zoom = mission_zoom(bare, solution.world, max_side, before.zoom if before else None)
+    photo_side = (before.photo_side if before else None) or typical_side(bare)
+    fusion = fusion_of(photo_side, max_side)
+    under = {f.frame_id: tiles_under(f, solution.world, zoom, fusion) if zoom else set() for f in bare}
     # A horizon shot fits nowhere; drawn by its GPS it would paint the sky beside the photos that do fit.
     tied = any(f.pose.source != "gnss" for f in bare)
     sky = {f.frame_id for f in bare if tied and f.pose.source == "gnss" and shows_sky(thumb(f.frame_id))}
@@ -105,6 +126,8 @@ def lay_out(
         under={k: frozenset(under[k]) for k in frames},
         rejected={k: code for k, code in lost.items() if k not in frames and k not in waiting},
         waiting=waiting,
+        photo_side=photo_side,
+        max_side=max_side,
     )
 
 
@@ -218,10 +241,10 @@ def _scaled(scale: KnownScale, frames: Sequence[GraphFrame]) -> PoseParams:
 
 def draw(layout: Layout, photos: _Photos) -> dict[TileKey, bytes]:
     """Every tile that shows something, overviews included."""
-    index = FrameIndex(layout.frames.values(), FUSION)
+    index = FrameIndex(layout.frames.values(), layout.fusion)
     natives: dict[TileKey, bytes] = {}
     for block in blocks(layout.cover):
-        drawn = draw_block(block, layout.world, index, photos)
+        drawn = draw_block(block, layout.world, index, photos, layout.fusion)
         natives |= {tile: encoded[0] for tile, encoded in drawn.items() if encoded is not None}
     return natives | pyramid(natives)
 

@@ -48,6 +48,7 @@ class Mission(Base):
     created_at: Mapped[float]
     world: Mapped[Json | None]  # lat_deg, lon_deg, alt_m
     zoom: Mapped[int | None]  # of the native tiles
+    photo_side: Mapped[int | None]  # the longest side, in pixels, of a typical photo
     cameras: Mapped[Json] = mapped_column(default=dict)  # camera_key → fields of core.geometry.Camera
     submaps: Mapped[Json | None]  # core.submaps.SubmapGraph.to_json() of the last solve
     scale: Mapped[Json | None]  # core.scale.KnownScale.to_json()

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from core.archives import TileSet, write_folder, write_mbtiles, write_pmtiles
 from core.cog import DEFAULT as COG
 from core.cog import MosaicPlan
-from core.coverage import mission_gsd_m
+from core.coverage import fusion_of, mission_gsd_m
 from core.errors import NothingToMap, OrthostreamError
 from core.exports import (
     NamedFrame,
@@ -159,7 +159,8 @@ def _plan(mission: Mission) -> MosaicPlan:
     world, named = _placed(mission)
     drawn: list[PosedFrame] = [n.posed for n in named]
     params = replace(COG, threads=settings.workers)
-    return MosaicPlan.of(world, drawn, mission_gsd_m(drawn, mission.drawn_side), params)
+    fusion = fusion_of(mission.photo_side, mission.drawn_side)
+    return MosaicPlan.of(world, drawn, mission_gsd_m(drawn, mission.drawn_side), params, fusion)
 
 
 def _poses(path: Path, mission: Mission, _wanted: Export) -> None:

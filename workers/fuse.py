@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 
-from core.coverage import FUSION, Encoded, block_grid, blocks, draw_block, overview, quarter, tiles_under
-from core.fusion import FrameIndex, Territory
-from core.grid import TileKey, children, parent, zoom_resolution_m
+from core.coverage import Encoded, block_grid, blocks, draw_block, fusion_of, overview, quarter, tiles_under
+from core.fusion import FrameIndex, FusionParams, Territory
+from core.grid import TILE_PX, TileKey, children, parent, zoom_resolution_m
 from core.inputs import frame_digest, tile_inputs
 from core.patching import fill_block
 from services.catalog import backlog, missions, poses, tiles
@@ -40,16 +40,18 @@ class _Sight:
     known: Poses
     index: FrameIndex
     photos: MissionPhotos
+    fusion: FusionParams
     digests: dict[str, bytes] = field(default_factory=dict)
 
     @classmethod
     def of(cls, mission: Mission, known: Poses) -> _Sight:
-        index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], FUSION)
+        fusion = fusion_of(known.photo_side, mission.tile_side)
+        index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], fusion)
         photos = MissionPhotos(shelf, mission.id, mission.tile_side)
         if known.world is not None and known.zoom is not None:
             resolution_m = zoom_resolution_m(known.zoom, known.world.lat_deg)
-            photos = replace(photos, likely=Territory(index, resolution_m).share)
-        return cls(mission, known, index, photos)
+            photos = replace(photos, likely=Territory(index, resolution_m, fusion).share)
+        return cls(mission, known, index, photos, fusion)
 
     def shows(self, zoom: int) -> bool:
         """Whether tiles of this zoom show anything: those of another than the mission's are overviews."""
@@ -63,7 +65,7 @@ class _Sight:
             if frame.frame_id not in self.digests:
                 self.digests[frame.frame_id] = frame_digest(frame)
         digests = [self.digests[f.frame_id] for f in around]
-        return tile_inputs(tile, self.known.world, self.mission.tile_side, digests, FUSION)
+        return tile_inputs(tile, self.known.world, self.mission.tile_side, digests, self.fusion)
 
 
 @stage("fuse")
@@ -102,7 +104,7 @@ def _fuse_group(mission_id: str, group: Sequence[Sequence[TileKey]], clock: Stop
         if not wanted:
             return  # this task ran before, or somebody else was faster
         mission = missions.get(tx, mission_id)
-        known = near(poses.load(tx, mission_id, _box(mission, list(wanted))), mission.tile_zoom)
+        known = near(poses.load(tx, mission_id, _box(mission, list(wanted))), mission)
     sight = _Sight.of(mission, known)
     for block in group:
         mine = {tile: wanted[tile] for tile in block if tile in wanted}
@@ -118,16 +120,18 @@ def _box(mission: Mission, block: Sequence[Key]) -> TileBox:
     """The tiles around the block among those by which poses are found: next to it frames move its seams."""
     finer = max(0, block[0][0] - (mission.zoom or 0))
     xs, ys = [x >> finer for _, x, _ in block], [y >> finer for _, _, y in block]
-    return TileBox(block[0][0] - finer, min(xs) - 1, min(ys) - 1, max(xs) + 1, max(ys) + 1)
+    rim = -(-fusion_of(mission.photo_side, mission.tile_side).rim_px // TILE_PX)
+    return TileBox(block[0][0] - finer, min(xs) - rim, min(ys) - rim, max(xs) + rim, max(ys) + rim)
 
 
-def near(known: Poses, zoom: int | None) -> Poses:
-    """The same poses, with the tiles of this zoom that they touch."""
+def near(known: Poses, mission: Mission) -> Poses:
+    """The same poses, with the tiles that they touch of the zoom that is drawn now."""
+    zoom, fusion = mission.tile_zoom, fusion_of(mission.photo_side, mission.tile_side)
     if known.world is None or zoom is None or zoom == known.zoom:
         return known
     found: dict[str, Placed] = {}
     for frame_id, placed in known.placed.items():
-        under = tiles_under(placed.posed(known.cameras), known.world, zoom)
+        under = tiles_under(placed.posed(known.cameras), known.world, zoom, fusion)
         xs, ys = [t.x for t in under], [t.y for t in under]
         if under:
             found[frame_id] = replace(placed, box=TileBox(zoom, min(xs), min(ys), max(xs), max(ys)))
@@ -160,7 +164,7 @@ def _redrawn(
     left = [tile for tile in block if tile not in {TileKey(*r.key) for r in done}]
     if not left:
         return done, 0
-    found = draw_block(left, world, sight.index, sight.photos)
+    found = draw_block(left, world, sight.index, sight.photos, sight.fusion)
     put = [putting(store, mission.id, wanted[t].generation, t, p, inputs[t]) for t, p in found.items()]
     if len(left) == len(wanted) and mission.final_generation is not None:
         made = _with_above(mission.id, put, found)

@@ -123,10 +123,16 @@ def _layout(poses: Poses) -> Layout | None:
     if poses.world is None:
         return None
     frames = {k: p.posed(poses.cameras) for k, p in poses.placed.items()}
-    under: dict[str, frozenset[TileKey]] = {}
-    if poses.zoom is not None:
-        under = {k: frozenset(tiles_under(f, poses.world, poses.zoom)) for k, f in frames.items()}
-    return Layout(poses.world, poses.zoom, poses.cameras, frames, under, {}, poses.waiting)
+    sides = (poses.photo_side, poses.max_side)
+    bare = Layout(poses.world, poses.zoom, poses.cameras, frames, {}, {}, poses.waiting, *sides)
+    return bare if poses.zoom is None else _on_tiles(bare, poses.zoom)
+
+
+def _on_tiles(layout: Layout, zoom: int) -> Layout:
+    """The same frames on the tiles of this zoom."""
+    fusion = layout.fusion
+    under = {k: frozenset(tiles_under(f, layout.world, zoom, fusion)) for k, f in layout.frames.items()}
+    return replace(layout, zoom=zoom, under=under)
 
 
 def joined(
@@ -142,7 +148,7 @@ def joined(
     for frame_id in sorted(set(new_ids) & set(solution.poses)):
         camera = cameras[keys[frame_id]]
         frame = PosedFrame(frame_id, camera, solution.poses[frame_id])
-        tiles = frozenset(tiles_under(frame, layout.world, layout.zoom))
+        tiles = frozenset(tiles_under(frame, layout.world, layout.zoom, layout.fusion))
         if 0 < len(tiles) <= MOST_TILES:
             frames[frame_id], under[frame_id] = frame, tiles
         else:
@@ -250,12 +256,9 @@ def everything(layout: Layout, published: Iterable[Key]) -> dict[Key, int]:
 
 
 def sharper(layout: Layout) -> Layout:
-    """The same frames on the tiles of the zoom that fits the full photos."""
+    """The same frames, drawn in full, on the tiles of the zoom that fits that."""
     zoom = mission_zoom(layout.frames.values(), layout.world, None)
-    if zoom is None:
-        return layout
-    under = {k: frozenset(tiles_under(f, layout.world, zoom)) for k, f in layout.frames.items()}
-    return replace(layout, zoom=zoom, under=under)
+    return layout if zoom is None else _on_tiles(replace(layout, max_side=None), zoom)
 
 
 def update_of(layout: Layout, keys: Mapping[str, str], new_ids: Collection[str] | None = None) -> PoseUpdate:
@@ -269,6 +272,7 @@ def update_of(layout: Layout, keys: Mapping[str, str], new_ids: Collection[str] 
         cameras=layout.cameras,
         world=layout.world,
         zoom=layout.zoom,
+        photo_side=layout.photo_side,
     )
 
 

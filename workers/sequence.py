@@ -232,10 +232,9 @@ def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, 
     """All that were ever read: what came since may tie in a frame that had no place before."""
     before = known.layout
     found, graph = solving.again(mission, known)
-    zoom_now = before.zoom if before is not None else None
     thumb = solving.thumbs(mission.id)
-    after = lay_out(found, known.camera_keys, thumb, mission.drawn_side, zoom_now, mission.mode)
-    if before is not None and before.zoom is not None and before.zoom != after.zoom:
+    after = lay_out(found, known.camera_keys, thumb, mission.drawn_side, before, mission.mode)
+    if before and before.zoom and (before.zoom, before.fusion) != (after.zoom, after.fusion):
         dirty = everything(after, _published(mission.id))
     else:
         dirty = changed(before, after).dirty(_may_heal(mission, after))

@@ -43,6 +43,7 @@ class PoseUpdate:
     `placed`: new and moved frames, unchanged ones are welcome. `unplaced`: frame_id → (code, sentence).
     `waiting`: frames that wait for a tie, with the pose on their island; None for one that is alone.
     `dirty`: native tile → priority (0 first), all that now look different. `cameras`: refined, by key.
+    `photo_side`: the longest side of a typical photo, pixels.
     `solved_frames`: frames in the global solve, when this was one; `submaps`: what it was made of. `final`:
     it was the canonical one. `pass_pixels`: what drawing all tiles once takes.
     """
@@ -54,6 +55,7 @@ class PoseUpdate:
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     world: World | None = None
     zoom: int | None = None
+    photo_side: int | None = None
     solved_frames: int | None = None
     reprojection_rms_px: float | None = None
     submaps: Mapping[str, Any] | None = None
@@ -65,7 +67,8 @@ class PoseUpdate:
 class Poses:
     """The mission's poses as of `generation`; `placed` by frame id, in its order.
 
-    `waiting`: as in PoseUpdate; empty when only a part of the map was read.
+    `waiting`: as in PoseUpdate; empty when only a part of the map was read. `photo_side`: of a typical photo,
+    `max_side`: at which photos are drawn at most, pixels.
     """
 
     generation: int
@@ -76,6 +79,8 @@ class Poses:
     solved_frames: int
     final_generation: int | None
     waiting: Mapping[str, Pose | None] = field(default_factory=dict)
+    photo_side: int | None = None
+    max_side: int | None = None
 
 
 def save(tx: Session, mission_id: str, epoch: int, change: PoseUpdate, now: float | None = None) -> int:
@@ -133,6 +138,8 @@ def load(tx: Session, mission_id: str, box: TileBox | None = None) -> Poses:
         solved_frames=row.solved_frames,
         final_generation=row.final_generation,
         waiting=waiting(tx, mission_id) if box is None else {},
+        photo_side=row.photo_side,
+        max_side=row.drawn_side,
     )
 
 
@@ -168,6 +175,8 @@ def _save_mission(row: Mission, change: PoseUpdate) -> None:
         row.world = {k: float(v) for k, v in asdict(change.world).items()}
     if change.zoom is not None:
         row.zoom = int(change.zoom)
+    if change.photo_side is not None:
+        row.photo_side = int(change.photo_side)
     if change.cameras:
         row.cameras = row.cameras | {key: _camera_json(c) for key, c in change.cameras.items()}
     if change.solved_frames is not None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import select
 
-from core.coverage import FUSION, block_grid
+from core.coverage import block_grid, fusion_of
 from core.fusion import FrameIndex
 from core.grid import TileKey
 from core.inputs import frame_digest, tile_inputs
@@ -31,10 +31,11 @@ def older_tiles(out: Path) -> dict[str, Any]:
     database.close()
     if known.world is None:
         return {"tiles": 0, "older": 0, "dirty": dirty}
-    index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], FUSION)
+    fusion = fusion_of(known.photo_side, side)
+    index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], fusion)
     digests = {f.frame_id: frame_digest(f) for f in index.frames}
     older = 0
     for tile, inputs in shown.items():
         near = [digests[f.frame_id] for f in index.overlapping(block_grid([tile]), known.world)]
-        older += inputs != tile_inputs(tile, known.world, side, near, FUSION)
+        older += inputs != tile_inputs(tile, known.world, side, near, fusion)
     return {"tiles": len(shown), "older": older, "dirty": dirty}

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 import core.mosaic as oracle
 from core import fusion
-from core.coverage import FUSION, block_grid
+from core.coverage import block_grid
 from core.fusion import FrameIndex, render
 
 LENGTH_PX, NEAR_PX, FAR_PX = 64, 2, 18
@@ -104,7 +104,7 @@ def measure(layout: oracle.Layout, photos: Any) -> Iterator[Piece]:
         FrameIndex(layout.frames.values()),
     )
     with Watched() as watched:
-        drawn = render(grid, layout.world, list(index.frames), photos, FUSION)
+        drawn = render(grid, layout.world, list(index.frames), photos, layout.fusion)
         sources = watched.sources(grid, ids)
     sources[drawn[..., 3] == 0] = -1
     found = list(pieces(sources))
@@ -116,7 +116,7 @@ def measure(layout: oracle.Layout, photos: Any) -> Iterator[Piece]:
         mine = np.array([box for box, piece in zip(boxes, found, strict=True) if k in piece[:2]])
         (top, left), (bottom, right) = mine[:, :2].min(0).tolist(), mine[:, 2:].max(0).tolist()
         window = grid.window(grid.col0 + left, grid.row0 + top, right - left, bottom - top)
-        return top, left, render(window, layout.world, [layout.frames[ids[k]]], photos, FUSION)
+        return top, left, render(window, layout.world, [layout.frames[ids[k]]], photos, layout.fusion)
 
     for (low, high, at), (y0, x0, y1, x1) in zip(found, boxes, strict=True):
         singles = []

@@ -158,7 +158,7 @@ def test_utm_windows_show_the_same_ground(picture: Rgb, flown: tuple[list[PosedF
     assert np.array_equal(part, drawn[101:200, 37:237])
 
 
-@pytest.mark.parametrize("bands", [3, 4, 5])
+@pytest.mark.parametrize("bands", [3, 4, 5, 6])
 def test_tiles_drawn_apart_fit_to_the_last_bit(flown: tuple[list[PosedFrame], Album], bands: int) -> None:
     frames, album = flown
     # Wider than the flight: the mosaic's own border crosses the tiles too.
@@ -173,7 +173,7 @@ def test_tiles_drawn_apart_fit_to_the_last_bit(flown: tuple[list[PosedFrame], Al
             assert np.array_equal(alone, drawn[row : row + 512, col : col + 640])
 
 
-@pytest.mark.parametrize("bands", [3, 4, 5])
+@pytest.mark.parametrize("bands", [3, 4, 5, 6])
 def test_what_was_not_warped_is_not_read(
     flown: tuple[list[PosedFrame], Album], monkeypatch: pytest.MonkeyPatch, bands: int
 ) -> None:

@@ -69,6 +69,20 @@ def test_it_shows_the_preview_first_and_the_full_oracle_in_the_end_without_a_hol
     assert (row.full, row.drawn_side, row.sharp_zoom) == (True, None, None)
 
 
+def test_full_photos_may_need_more_bands_than_the_preview(
+    sharp: Any, photos: list[tuple[str, bytes]], preview: Mosaic, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("core.coverage.USUAL_SIDE_PX", SIDE_PX)
+    full = build(photos)
+    assert full.layout.fusion.bands == preview.layout.fusion.bands + 1
+    sharp.upload(photos)
+    sharp.drain()
+    until_sharpening(sharp)
+    assert sharp.tiles() == {tuple(k): v for k, v in preview.tiles.items()}
+    sharp.drain(random.Random(2))
+    assert sharp.tiles() == {tuple(k): v for k, v in full.tiles.items()}
+
+
 def test_every_overview_is_the_reduction_of_its_children_at_each_revision(
     sharp: Any, photos: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -52,6 +52,36 @@ def test_shuffled_and_repeated_tasks_end_in_the_oracles_tiles(
     assert bench.tiles() == expected
 
 
+def test_large_photos_end_in_the_oracles_tiles_too(
+    bench: Any, photos: list[tuple[str, bytes]], expected: Tiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More bands than usual: frames reach farther, and move seams farther away."""
+    monkeypatch.setattr("core.coverage.USUAL_SIDE_PX", 160)
+    bench.upload(photos[::-1])
+    bench.drain(random.Random(5))
+    bench.finalise()
+    bench.drain(random.Random(6))
+    made = build(photos)
+    assert made.layout.fusion.bands == 6
+    assert bench.tiles() == {tuple(k): v for k, v in made.tiles.items()} != expected
+
+
+def test_a_map_whose_photos_turn_out_to_be_larger_is_drawn_anew(
+    bench: Any, photos: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing that is shown stays from when it was put together otherwise."""
+    bench.upload(photos[:5])
+    bench.drain()
+    bench.finalise()
+    bench.drain()
+    monkeypatch.setattr("core.coverage.USUAL_SIDE_PX", 320)
+    bench.upload(photos[5:])
+    bench.drain()
+    bench.finalise()
+    bench.drain()
+    assert bench.tiles() == {tuple(k): v for k, v in build(photos).tiles.items()}
+
+
 @pytest.fixture(scope="module")
 def two_drones(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[tuple[str, bytes]], Tiles]:
     """Five photos of each of two drones, in turns, and the oracle's tiles."""
