@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,8 @@ from core.frame import GpsFix
 Pair = tuple[str, str]
 Floats = NDArray[np.float64]
 
-_METRES_PER_DEGREE = 111_320.0
-_SIMILARITY_STEP = 1e-5
+METRES_PER_DEGREE = 111_320.0
+SIMILARITY_STEP = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,28 +56,25 @@ def candidates(frames: Sequence[Sighting], params: NeighbourParams | None = None
     """All pairs (low id, high id) worth matching, sorted; the order of `frames` does not matter."""
     params = params or NeighbourParams()
     ordered = _ordered(frames)
-    everyone = range(len(ordered))
-    return _pairs(ordered, ((i, j) for i, js in _partners(ordered, everyone, params) for j in js))
+    return _pairs(ordered, ((i, j) for i, js in _partners(ordered, params) for j in js))
 
 
-def candidates_of(
-    new: Sighting, others: Sequence[Sighting], params: NeighbourParams | None = None
-) -> list[Pair]:
-    """The pairs (low id, high id) of one new frame with those already there, sorted."""
-    params = params or NeighbourParams()
-    ordered = _ordered([new, *(o for o in others if o.frame_id != new.frame_id)])
-    me = next(i for i, f in enumerate(ordered) if f.frame_id == new.frame_id)
-    return _pairs(ordered, ((i, j) for i, js in _partners(ordered, [me], params) for j in js))
+class CaptureOrder(NamedTuple):
+    """Where a frame stands among all: by capture time, those without one last."""
+
+    captured_s: float
+    name: str
+    frame_id: str
+
+
+def capture_order(frame: Sighting) -> CaptureOrder:
+    """What frames are sorted by."""
+    return CaptureOrder(np.inf if frame.captured_s is None else frame.captured_s, frame.name, frame.frame_id)
 
 
 def _ordered(frames: Iterable[Sighting]) -> list[Sighting]:
     """Capture order, each frame once."""
-    unique = {f.frame_id: f for f in frames}.values()
-
-    def key(f: Sighting) -> tuple[float, str, str]:
-        return (np.inf if f.captured_s is None else f.captured_s, f.name, f.frame_id)
-
-    return sorted(unique, key=key)
+    return sorted({f.frame_id: f for f in frames}.values(), key=capture_order)
 
 
 def _pairs(ordered: Sequence[Sighting], indices: Iterable[tuple[int, int]]) -> list[Pair]:
@@ -84,30 +82,23 @@ def _pairs(ordered: Sequence[Sighting], indices: Iterable[tuple[int, int]]) -> l
     return sorted({(min(ids[i], ids[j]), max(ids[i], ids[j])) for i, j in indices if i != j})
 
 
-def _partners(
-    ordered: Sequence[Sighting], of: Sequence[int], params: NeighbourParams
-) -> Iterable[tuple[int, list[int]]]:
-    """For each frame index in `of` the indices of its partners, reason after reason."""
-    yield from _in_time(ordered, of, params)
-    yield from _in_space(ordered, of, params)
-    yield from _in_appearance(ordered, of, params)
+def _partners(ordered: Sequence[Sighting], params: NeighbourParams) -> Iterable[tuple[int, list[int]]]:
+    """For each frame's index the indices of its partners, reason after reason."""
+    yield from _in_time(ordered, params)
+    yield from _in_space(ordered, params)
+    yield from _in_appearance(ordered, params)
 
 
-def _in_time(
-    ordered: Sequence[Sighting], of: Sequence[int], params: NeighbourParams
-) -> Iterable[tuple[int, list[int]]]:
+def _in_time(ordered: Sequence[Sighting], params: NeighbourParams) -> Iterable[tuple[int, list[int]]]:
     by_drone = sorted(range(len(ordered)), key=lambda i: (ordered[i].drone, i))
-    wanted, reach = set(of), params.before_and_after
+    reach = params.before_and_after
     for _, group in groupby(by_drone, key=lambda i: ordered[i].drone):
         line = list(group)
         for place, i in enumerate(line):
-            if i in wanted:
-                yield i, line[max(0, place - reach) : place + reach + 1]
+            yield i, line[max(0, place - reach) : place + reach + 1]
 
 
-def _in_space(
-    ordered: Sequence[Sighting], of: Sequence[int], params: NeighbourParams
-) -> Iterable[tuple[int, list[int]]]:
+def _in_space(ordered: Sequence[Sighting], params: NeighbourParams) -> Iterable[tuple[int, list[int]]]:
     located = [i for i, f in enumerate(ordered) if f.gps is not None]
     if len(located) < 2:
         return
@@ -118,11 +109,9 @@ def _in_space(
         at[p].append(i)
     tree = cKDTree(xy)
     reach = min(len(xy), 8 * max(params.nearest, params.sectors) + 1)
-    wanted = set(of)
     for i, p in zip(located, position_of, strict=True):
-        if i in wanted:
-            _, near = tree.query(xy[p], k=reach)
-            yield i, _one_each(i, at, _spread(xy, int(p), np.atleast_1d(near), params))
+        _, near = tree.query(xy[p], k=reach)
+        yield i, one_each(i, at, spread(xy, int(p), np.atleast_1d(near), params))
 
 
 def metres(ordered: Sequence[Sighting], located: Sequence[int]) -> Floats:
@@ -134,10 +123,10 @@ def metres(ordered: Sequence[Sighting], located: Sequence[int]) -> Floats:
     lat_lon = np.array([(g.lat_deg, g.lon_deg) for g in fixes if g is not None])
     lon = lat_lon[:, 1] - np.median(lat_lon[:, 1])
     east = ((lon + 180) % 360 - 180) * np.cos(np.radians(np.median(lat_lon[:, 0])))
-    return np.round(np.column_stack((east, lat_lon[:, 0])) * _METRES_PER_DEGREE, 2)
+    return np.round(np.column_stack((east, lat_lon[:, 0])) * METRES_PER_DEGREE, 2)
 
 
-def _spread(xy: Floats, p: int, near: NDArray[np.intp], params: NeighbourParams) -> list[int]:
+def spread(xy: Floats, p: int, near: NDArray[np.intp], params: NeighbourParams) -> list[int]:
     """Of the near positions, nearest first, the nearest few and the nearest in each direction; p leads."""
     near = near[near != p]
     offset = xy[near] - xy[p]
@@ -147,7 +136,7 @@ def _spread(xy: Floats, p: int, near: NDArray[np.intp], params: NeighbourParams)
     return [p, *sorted(chosen)]
 
 
-def _one_each(i: int, at: Sequence[Sequence[int]], positions: Sequence[int]) -> list[int]:
+def one_each(i: int, at: Sequence[Sequence[int]], positions: Sequence[int]) -> list[int]:
     """One frame per position, the next in capture order; of i's own position one before and one after."""
     here = at[positions[0]]
     place = here.index(i)
@@ -155,40 +144,25 @@ def _one_each(i: int, at: Sequence[Sequence[int]], positions: Sequence[int]) -> 
     return [*here[max(0, place - 1) : place + 2], *there]
 
 
-def _in_appearance(
-    ordered: Sequence[Sighting], of: Sequence[int], params: NeighbourParams
-) -> Iterable[tuple[int, list[int]]]:
+def _in_appearance(ordered: Sequence[Sighting], params: NeighbourParams) -> Iterable[tuple[int, list[int]]]:
     if len(ordered) < 2:
         return
-    words = np.stack([f.words for f in ordered])
-    apart = peculiar(words) if len(of) > 1 else None
-    for block in (of[k : k + 256] for k in range(0, len(of), 256)):
+    apart = peculiar(np.stack([f.words for f in ordered]))
+    for start in range(0, len(ordered), 256):
         # Rounded, so that the last bits of a product do not decide between twins: the earlier one wins.
-        product = apart[block] @ apart.T if apart is not None else _alike_one(words, block[0])[None]
-        similarity = np.round(product / _SIMILARITY_STEP)
-        similarity[np.arange(len(block)), block] = -np.inf
-        for i, row in zip(block, similarity, strict=True):
+        similarity = np.round(apart[start : start + 256] @ apart.T / SIMILARITY_STEP)
+        for i, row in enumerate(similarity, start):
+            row[i] = -np.inf
             count = params.alike if ordered[i].gps is not None else params.alike_without_gps
-            yield i, _highest(row, min(count, len(ordered) - 1))
+            yield i, highest(row, min(count, len(ordered) - 1))
 
 
-def _highest(row: NDArray[np.float32], count: int) -> list[int]:
+def highest(row: NDArray[np.float32], count: int) -> list[int]:
     """The places of the `count` highest values (N,), the earlier place first among equals."""
     if count == 0:
         return []
     enough = np.flatnonzero(row >= np.partition(row, -count)[-count])
     return [int(j) for j in enough[np.argsort(-row[enough], kind="stable")][:count]]
-
-
-def _alike_one(words: NDArray[np.float32], i: int) -> NDArray[np.float32]:
-    """One row of the products of `peculiar` words with each other (N,), without working out all of them."""
-    mean = np.full(len(words), 1 / len(words), np.float32) @ words
-    mine = words[i] - mean
-    # (a − m)·(b − m) and |a − m|² without a copy of all words
-    to_mine, to_mean = (words @ np.column_stack((mine, mean))).T
-    length2 = np.einsum("ij,ij->i", words, words) - 2 * to_mean + mean @ mean
-    apart = np.sqrt(np.maximum(length2, 1e-12) * max(float(mine @ mine), 1e-12))
-    return np.asarray((to_mine - mean @ mine) / apart, np.float32)
 
 
 def peculiar(words: NDArray[np.float32]) -> NDArray[np.float32]:

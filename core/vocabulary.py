@@ -69,6 +69,19 @@ def shipped() -> Vocabulary:
     return Vocabulary.from_bytes((files("core") / "vocabulary.npz").read_bytes())
 
 
+LOOKS = 512
+"""So many numbers are a picture's looks."""
+
+
+def looks(words: Floats) -> NDArray[np.float16]:
+    """The more telling half of an appearance vector (1024,): (`LOOKS`,), each word's stronger dimensions.
+
+    Found by it, the most similar picture shows the same ground about as often as by all of it; what all
+    photos of a mission look like takes half the memory and half the time.
+    """
+    return words.reshape(32, 32)[:, : LOOKS // 32].ravel().astype(np.float16)
+
+
 def appearance(descriptors: NDArray[np.uint8]) -> Floats:
     """The appearance vector of a picture with these descriptors (N, 128) uint8, in the shipped vocabulary."""
     return shipped().appearance(descriptors)

@@ -96,6 +96,7 @@ class Frame(Base):
         Index("ix_frames_mission_id_received_at_id", "mission_id", "received_at", "id"),
         Index("ix_frames_state_received_at", "state", "received_at"),
         Index("ix_frames_ready_at", "ready_at"),
+        Index("ix_frames_mission_id_ready_at", "mission_id", "ready_at"),
         Index("ix_frames_matched_at", "matched_at"),
     )
 
@@ -110,6 +111,7 @@ class Frame(Base):
     reason_code: Mapped[str | None]
     reason: Mapped[str | None]
     meta: Mapped[Json | None]  # core.frame.FrameMeta
+    looks: Mapped[bytes | None] = mapped_column(deferred=True)  # core.vocabulary.looks
     telemetry: Mapped[Json | None]
     received_at: Mapped[float]
     ready_at: Mapped[float | None]

@@ -10,6 +10,7 @@ from core.errors import PhotoLost, RejectedFrame
 from core.features import FEATURE_SIDE_PX, Features, extract
 from core.frame import FrameMeta
 from core.metadata import read_metadata
+from core.vocabulary import looks
 from services.catalog import frames
 from services.catalog.frames import Attempt
 from services.errors import ObjectNotFound, OutOfDisk
@@ -58,7 +59,7 @@ def _read_in(mission_id: str, frame_id: str, attempt: Attempt, clock: Stopwatch)
     with _uncounted(mission_id, frame_id):
         store.put(features_key(mission_id, frame_id), features.to_bytes())
     with db.write(durable=False) as tx:
-        if frames.mark_ready(tx, mission_id, frame_id, meta):
+        if frames.mark_ready(tx, mission_id, frame_id, meta, looks=looks(features.words).tobytes()):
             clock.spend(tx, mission_id, "ingest")
     return True
 

@@ -177,10 +177,18 @@ def forgive(tx: Session, mission_id: str, frame_id: str) -> None:
 
 
 def mark_ready(
-    tx: Session, mission_id: str, frame_id: str, meta: FrameMeta, now: float | None = None
+    tx: Session,
+    mission_id: str,
+    frame_id: str,
+    meta: FrameMeta,
+    now: float | None = None,
+    looks: bytes | None = None,
 ) -> bool:
-    """Received → ready with what was read. False, and nothing written, when it had come further already."""
-    values = {"meta": meta.to_json(), "ready_at": clock(now)}
+    """Received → ready with what was read. False, and nothing written, when it had come further already.
+
+    `looks`: see `arrivals.Arrived`.
+    """
+    values = {"meta": meta.to_json(), "ready_at": clock(now), "looks": looks}
     return _advance(tx, mission_id, frame_id, "received", "ready", values, now)
 
 
@@ -312,24 +320,15 @@ def list(
     return tx.scalars(query.order_by(Frame.received_at, Frame.id).limit(limit)).all()
 
 
-def sightings(tx: Session, mission_id: str, known: Mapping[str, Seen] | None = None) -> Sequence[Seen]:
-    """Every frame that could be read, by id: also those that the pose graph could not place yet.
-
-    `known`: frames that need not be read again, for what was read of a photo never changes.
-    """
-    known = known or {}
+def sightings(tx: Session, mission_id: str) -> Sequence[Seen]:
+    """Every frame that could be read, by id: also those that the pose graph could not place yet."""
     query = (
-        select(Frame.id, Frame.name, Frame.state)
+        select(Frame.id, Frame.name, Frame.state, Frame.meta)
         .where(Frame.mission_id == mission_id, Frame.meta.is_not(None))
         .where(or_(Frame.state != "rejected", Frame.matched_at.is_not(None)))
         .order_by(Frame.id)
     )
-    rows = [(i, name, state) for i, name, state in tx.execute(query)]
-    metas = {i: known[i].meta for i, _, _ in rows if i in known}
-    for some in chunks([i for i, _, _ in rows if i not in known]):
-        fresh = select(Frame.id, Frame.meta).where(Frame.mission_id == mission_id, Frame.id.in_(some))
-        metas |= {i: FrameMeta.from_json(meta or {}) for i, meta in tx.execute(fresh)}
-    return [Seen(i, name, state, metas[i]) for i, name, state in rows]
+    return [Seen(i, name, state, FrameMeta.from_json(m or {})) for i, name, state, m in tx.execute(query)]
 
 
 def latencies_s(tx: Session, mission_id: str) -> Sequence[float]:

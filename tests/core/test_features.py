@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from core.features import FeatureParams, Features, extract
+from core.neighbours import peculiar
+from core.vocabulary import LOOKS, looks
 
 Rgb = np.ndarray
 
@@ -108,6 +110,18 @@ def test_appearance_is_a_unit_vector_and_tells_places_apart() -> None:
     a, b, c = (extract(p, (640, 480)).words for p in (photo, half, other))
     assert abs(np.linalg.norm(a) - 1) < 1e-5
     assert a @ b > a @ c + 0.1
+
+
+def test_looks_tell_as_much_as_all_words_in_a_quarter_of_the_bytes() -> None:
+    photo = ground(seed=1)
+    places = [photo, *(np.roll(photo, k, axis=1) for k in (40, 80, 160)), ground(seed=2), ground(seed=3)]
+    words = np.stack([extract(p, (640, 480)).words for p in places])
+    short = np.stack([looks(w) for w in words])
+    assert short.shape == (6, LOOKS)
+    assert 4 * short.nbytes == words.nbytes
+    whole, part = (peculiar(np.float32(w)) for w in (words, short))
+    assert np.abs(whole @ whole.T - part @ part.T).max() < 0.2
+    assert (part[0] @ part[1:4].T).min() > (part[0] @ part[4:].T).max() + 0.2
 
 
 def test_a_picture_without_anything_has_no_features_but_a_thumbnail() -> None:

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from core.frame import GpsFix
-from core.neighbours import NeighbourParams, Pair, Sighting, candidates, candidates_of
+from core.gallery import Gallery
+from core.neighbours import NeighbourParams, Pair, Sighting, candidates
 
 METRE = 1 / 111_320
 
@@ -152,19 +153,47 @@ def test_few_frames() -> None:
     assert candidates(frames[:1]) == []
     assert candidates(frames[:2]) == [key(frames[0], frames[1])]
     assert candidates([frames[0], frames[0]]) == []
-    assert candidates_of(frames[0], []) == []
+    assert partners_of(frames[0], []) == []
 
 
-def test_live_candidates_are_of_the_new_frame_only_and_find_its_neighbours() -> None:
+def partners_of(new: Sighting, others: list[Sighting], params: NeighbourParams | None = None) -> list[Pair]:
+    """As they come: first the others, then the new one."""
+    gallery = Gallery()
+    gallery.add([*others, new])
+    return gallery.partners(new.frame_id, params)
+
+
+def test_live_partners_are_of_the_new_frame_only_and_those_of_all_frames_at_once() -> None:
     frames = flight(noise_m=5)
+    gallery = Gallery()
+    gallery.add(random.Random(2).sample(frames, len(frames)))
+    each = {f.frame_id: gallery.partners(f.frame_id) for f in frames}
+    for frame_id, found in each.items():
+        assert found == sorted(set(found))
+        assert all(frame_id in pair and pair[0] < pair[1] for pair in found)
+    union = {pair for found in each.values() for pair in found}
+    assert union == set(candidates(frames)) >= next_to_each_other(frames)
+
+
+def test_live_partners_do_not_depend_on_the_order_of_arrival() -> None:
+    frames = [replace(f, gps=None) if k % 5 == 0 else f for k, f in enumerate(flight(noise_m=20))]
     new, others = frames[31], frames[:31] + frames[32:]
-    pairs = candidates_of(new, others)
-    assert all(new.frame_id in p for p in pairs)
-    assert pairs == candidates_of(new, others[::-1])
-    assert pairs == candidates_of(new, frames)
-    mine = {p for p in next_to_each_other(frames) if new.frame_id in p}
-    assert mine <= set(pairs)
-    assert set(pairs) <= set(candidates(frames))
+    found = partners_of(new, others)
+    assert partners_of(new, others[::-1]) == partners_of(new, frames) == found
+
+
+def test_a_drone_that_hovers_is_one_position_and_does_not_hide_the_others() -> None:
+    frames = flight(rows=20, noise_m=2)
+    stuck = [replace(f, gps=frames[20].gps) if 10 <= k <= 160 else f for k, f in enumerate(frames)]
+    fix_of = {f.frame_id: f.gps for f in stuck}
+    params = NeighbourParams(nearest=3, sectors=4, before_and_after=0, alike=0)
+    gallery = Gallery()
+    gallery.add(stuck)
+    for frame in stuck:
+        found = gallery.partners(frame.frame_id, params)
+        elsewhere = {fix_of[k] for pair in found for k in pair} - {frame.gps}
+        assert params.nearest <= len(elsewhere) <= params.nearest + params.sectors
+        assert len(found) <= len(elsewhere) + 2
 
 
 def test_frames_across_the_date_line_are_near() -> None:
@@ -176,4 +205,12 @@ def test_frames_across_the_date_line_are_near() -> None:
         for k, f in enumerate(flight()[2:])
     ]
     params = NeighbourParams(nearest=1, sectors=0, alike=0)
-    assert key(west, east) in candidates_of(west, [east, *far], params)
+    assert key(west, east) in candidates([west, east, *far], params)
+    assert key(west, east) in partners_of(west, [east, *far], params)
+
+
+def test_a_lost_fix_far_away_changes_nobody_elses_partners() -> None:
+    frames = flight(noise_m=5)
+    stray = replace(frames[0], frame_id="f" * 32, gps=GpsFix(0.0, 0.0), captured_s=None, drone="x")
+    params = NeighbourParams(alike=0)
+    assert partners_of(frames[31], [stray, *frames], params) == partners_of(frames[31], frames, params)

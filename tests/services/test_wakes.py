@@ -1,9 +1,6 @@
-"""Few wake-ups, none missed; what was read once is not read again. On every backend."""
+"""Few wake-ups, none missed. On every backend."""
 
 from __future__ import annotations
-
-import pytest
-from sqlalchemy import event
 
 from core.frame import FrameMeta
 from services.catalog import backlog, frames, pairs
@@ -64,25 +61,3 @@ def test_pairs_with_a_result_are_counted(db: Database, mission_id: str) -> None:
         for key in (("a", "b"), ("b", "c"), ("a", "b")):
             pairs.record(tx, mission_id, [PairResult(*key, False, "no_common_turn", 0, {}, None)])
         assert pairs.computed(tx, mission_id) == 2
-
-
-@pytest.mark.parametrize("known", ["", "a", "abc"])
-def test_known_frames_are_seen_in_their_new_state_without_being_read_again(
-    db: Database, mission_id: str, known: str
-) -> None:
-    arrive(db, mission_id, "abc")
-    with db.read() as tx:
-        before = {s.frame_id: s for s in frames.sightings(tx, mission_id) if s.frame_id in known}
-    with db.write() as tx:
-        frames.mark_matched(tx, mission_id, "b", 2.0)
-    asked: list[str] = []
-
-    def note(*call: object) -> None:
-        asked.append(str(call[2]))
-
-    with db.read() as tx:
-        event.listen(tx.connection(), "before_cursor_execute", note)
-        seen = frames.sightings(tx, mission_id, before)
-        assert seen == frames.sightings(tx, mission_id)
-    assert [(s.frame_id, s.state) for s in seen] == [("a", "ready"), ("b", "matched"), ("c", "ready")]
-    assert sum("frames.meta \n" in statement for statement in asked) == (known != "abc") + 1

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from core import neighbours, ties
+from core.gallery import Gallery
 from core.mosaic import build
 from core.neighbours import NeighbourParams, Pair, Sighting
 from core.simulation import FlightParams
@@ -93,9 +94,11 @@ def test_the_first_frame_that_sees_two_maps_makes_them_one(
 def test_two_drones_maps_merge_while_they_fly_though_no_neighbour_was_found(
     bench: Any, strips: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def same_drone(mission_id: str, seen: Any, frame_id: str) -> list[Pair]:
-        mine = seen[frame_id].meta.drone
-        return [(min(k, frame_id), max(k, frame_id)) for k in seen if seen[k].meta.drone == mine]
+    def same_drone(gallery: Gallery, frame_id: str) -> list[Pair]:
+        mine = gallery.sighting(frame_id).drone
+        others = gallery.row_of.keys() - {frame_id}
+        same = [k for k in others if gallery.sighting(k).drone == mine]
+        return [(min(k, frame_id), max(k, frame_id)) for k in same]
 
     def maps() -> set[int]:
         with bench.db.read() as tx:
