@@ -93,8 +93,8 @@ def balance(
 ) -> Mapping[str, Gain]:
     """What each frame's channels (R, G, B) are to be multiplied with, by frame id; gains given are ignored.
 
-    `thumbs`: whole photos at about 128 px, (h, w, 3 or more) uint8, RGB first. The frames' order does
-    not matter.
+    `thumbs`: whole photos at about 128 px, or `shrunk`, (h, w, 3 or more) uint8, RGB first. The frames'
+    order does not matter.
     """
     return {frame.frame_id: frame.gain for frame in balanced(frames, world, thumbs, params)}
 
@@ -140,6 +140,13 @@ def replace_light(frame: PosedFrame, gain: Gain, falloff: tuple[float, ...]) -> 
     return replace(frame, gain=gain, camera=replace(frame.camera, falloff=falloff))
 
 
+def shrunk(thumb: Thumb, params: ExposureParams = DEFAULT) -> Thumb:
+    """A thumbnail as its colours are compared; what was shrunk before stays as it is."""
+    scale = params.side_px / max(thumb.shape[:2])
+    size = (max(2, round(thumb.shape[1] * scale)), max(2, round(thumb.shape[0] * scale)))
+    return np.asarray(cv2.resize(thumb, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def light_apart(one: PosedFrame, other: PosedFrame) -> float:
     """By how much, at most, the logarithm of the light in which a frame is drawn is another in these two."""
     gain = np.abs(np.log(one.gain) - np.log(other.gain))
@@ -178,9 +185,6 @@ def _sighting(
     reach = 3 * (abs(pose.center[2] - pose.ground_h_m) + step)
     low = np.floor(np.maximum(outline.min(0), pose.center[:2] - reach) / step).astype(np.int64)
     high = np.ceil(np.minimum(outline.max(0), pose.center[:2] + reach) / step).astype(np.int64)
-    scale = params.side_px / max(thumb.shape[:2])
-    size = (max(2, round(thumb.shape[1] * scale)), max(2, round(thumb.shape[0] * scale)))
-    small = np.asarray(cv2.resize(thumb, size, interpolation=cv2.INTER_AREA), np.uint8)
     most = int(np.prod(high - low + 1))
     cells, colour, place = np.empty(most, np.int64), np.empty((most, 3)), np.empty((most, 3))
     found = _sight(
@@ -189,7 +193,7 @@ def _sighting(
         np.ascontiguousarray(pose.world_R_cam, np.float64),
         np.array((*pose.center, pose.ground_h_m), np.float64),
         intrinsics(camera),
-        small,
+        shrunk(thumb, params),
         np.array((params.darkest, params.brightest)),
         cells,
         colour,

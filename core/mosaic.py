@@ -28,8 +28,8 @@ from core.exposure import balanced
 from core.features import FEATURE_SIDE_PX, Features, extract
 from core.fusion import FrameIndex, FusionParams
 from core.geometry import Camera, Pose, PosedFrame, World
+from core.glance import Glance, glance
 from core.grid import TileKey
-from core.horizon import shows_sky
 from core.matching import PairMatch, match_pair
 from core.metadata import read_metadata
 from core.neighbours import Pair, Sighting
@@ -93,12 +93,12 @@ def frame_id_of(data: bytes) -> str:
 def lay_out(
     solution: Solution,
     camera_keys: Mapping[str, str],
-    thumb: Callable[[str], Pixels],
+    look: Callable[[str], Glance],
     max_side: int | None,
     before: Layout | None = None,
     mode: str = "visual",
 ) -> Layout:
-    """Where and how bright every posed frame is drawn.
+    """Where and how bright every posed frame is drawn. `look`: a frame's glance by its id.
 
     `before`: what is shown now; its zoom is kept while it fits well enough, and its typical photo.
     """
@@ -112,9 +112,9 @@ def lay_out(
     under = {f.frame_id: tiles_under(f, solution.world, zoom, fusion) if zoom else set() for f in bare}
     # A horizon shot fits nowhere; drawn by its GPS it would paint the sky beside the photos that do fit.
     tied = any(f.pose.source != "gnss" for f in bare)
-    sky = {f.frame_id for f in bare if tied and f.pose.source == "gnss" and shows_sky(thumb(f.frame_id))}
+    sky = {f.frame_id for f in bare if tied and f.pose.source == "gnss" and look(f.frame_id).sky}
     good = [f for f in bare if 0 < len(under[f.frame_id]) <= MOST_TILES and f.frame_id not in sky]
-    lit = balanced(good, solution.world, {f.frame_id: thumb(f.frame_id) for f in good})
+    lit = balanced(good, solution.world, {f.frame_id: look(f.frame_id).colours for f in good})
     frames = {f.frame_id: replace(f, gain=_rgb(f.gain)) for f in lit}
     lost = {f.frame_id: "oblique" for f in bare} | dict(solution.unplaced)
     waiting = waiting_frames(solution, mode)
@@ -211,7 +211,7 @@ def build(
     assert wanted is not None  # `matched` never puts off
     solution, submaps = solved(frames, wanted, scale)
     camera_keys = {k: r.frame.meta.camera_key for k, r in read.items()}
-    layout = lay_out(solution, camera_keys, lambda k: read[k].features.thumb, max_side, mode=mode)
+    layout = lay_out(solution, camera_keys, lambda k: glance(read[k].features.thumb), max_side, mode=mode)
     tiles = draw(layout, _Photos(read, max_side))
     return Mosaic(solution, layout, tiles, rejected | dict(layout.rejected), submaps)
 

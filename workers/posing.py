@@ -11,9 +11,10 @@ import numpy as np
 
 from core import errors
 from core.coverage import mission_zoom, moved_px, outline_px, tiles_under
-from core.exposure import Thumb, fitted, light_apart
+from core.exposure import fitted, light_apart
 from core.frame import FrameMeta
 from core.geometry import Pose, PosedFrame
+from core.glance import Glance
 from core.grid import TileKey, ancestors
 from core.matching import PairMatch
 from core.mosaic import MOST_TILES, Layout, waiting_frames
@@ -158,13 +159,13 @@ def joined(
 
 
 def exposed(
-    layout: Layout, new_ids: Collection[str], matches: Sequence[PairMatch], thumb: Callable[[str], Thumb]
+    layout: Layout, new_ids: Collection[str], matches: Sequence[PairMatch], look: Callable[[str], Glance]
 ) -> Layout:
     """The layout with its new frames as bright as what they overlap, until the next balance of all."""
     new = [layout.frames[k] for k in sorted(set(new_ids) & layout.frames.keys())]
     near = {k for frame in new for k in _alike(frame, layout.frames, set(new_ids), matches)}
-    thumbs = {k: thumb(k) for k in sorted(near | {f.frame_id for f in new})}
-    lit = fitted(new, [layout.frames[k] for k in sorted(near)], thumbs)
+    colours = {k: look(k).colours for k in sorted(near | {f.frame_id for f in new})}
+    lit = fitted(new, [layout.frames[k] for k in sorted(near)], colours)
     return replace(layout, frames={**layout.frames, **{f.frame_id: f for f in lit}})
 
 

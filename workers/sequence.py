@@ -202,7 +202,7 @@ def _pose(mission: Mission, epoch: int, new: Sequence[Frame]) -> None:
         found = place(solution, frames_here, new_ids, matches)
         keys = {k: known.seen[k].meta.camera_key for k in new_ids}
         grown = joined(before, found, new_ids, keys, mission.mode)
-        after = exposed(grown, new_ids, matches, solving.thumbs(mission.id))
+        after = exposed(grown, new_ids, matches, solving.glances(mission.id))
         dirty = known.grown(after, new_ids)
         update = update_of(after, keys, new_ids)
     with db.write() as tx:
@@ -232,8 +232,8 @@ def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, 
     """All that were ever read: what came since may tie in a frame that had no place before."""
     before = known.layout
     found, graph = solving.again(mission, known)
-    thumb = solving.thumbs(mission.id)
-    after = lay_out(found, known.camera_keys, thumb, mission.drawn_side, before, mission.mode)
+    look = solving.glances(mission.id)
+    after = lay_out(found, known.camera_keys, look, mission.drawn_side, before, mission.mode)
     if before and before.zoom and (before.zoom, before.fusion) != (after.zoom, after.fusion):
         dirty = everything(after, _published(mission.id))
     else:
@@ -291,7 +291,7 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
     points = surveyed.points_of(mission.id)
     found, submaps = solved(list(graph.values()), pairs_of_all, KnownScale.from_json(mission.scale), points)
     keys = {k: f.meta.camera_key for k, f in graph.items()}
-    layout = lay_out(found, keys, solving.thumbs(mission.id), mission.drawn_side, mode=mission.mode)
+    layout = lay_out(found, keys, solving.glances(mission.id), mission.drawn_side, mode=mission.mode)
     update = replace(
         update_of(layout, keys),
         dirty=everything(layout, _published(mission.id)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
+from core.glance import Glance, glance
 from core.matching import PairMatch
 from core.mosaic import solved
 from core.pose_graph import Solution
@@ -14,11 +15,12 @@ from services.catalog import pairs
 from services.tables import Mission
 from workers import surveyed
 from workers.app import db, settings
-from workers.photos import BytesLru, Pixels, shelf
+from workers.photos import BytesLru, shelf
 from workers.posing import Known
 
-_thumbs = BytesLru(settings.photo_cache_bytes // 2)
-"""A sequencer draws no tiles: what others hold photos with holds the thumbnails of every solve."""
+_glances = BytesLru(settings.photo_cache_bytes // 2)
+"""A sequencer draws no tiles: what others hold photos with holds the glances of every solve."""
+_OVERHEAD_BYTES = 400
 
 
 def matches(mission_id: str, touching: Collection[str] | None) -> list[PairMatch]:
@@ -27,18 +29,18 @@ def matches(mission_id: str, touching: Collection[str] | None) -> list[PairMatch
         return [PairMatch.from_bytes(m) for m in pairs.accepted(tx, mission_id, touching)]
 
 
-def thumbs(mission_id: str) -> Callable[[str], Pixels]:
-    """A frame's thumbnail by its id. That raises ObjectNotFound."""
+def glances(mission_id: str) -> Callable[[str], Glance]:
+    """A frame's glance by its id. That raises ObjectNotFound."""
 
-    def thumb(frame_id: str) -> Pixels:
-        def load() -> tuple[Pixels, int]:
-            found = shelf.features_of(mission_id, frame_id).thumb.copy()
-            return found, found.nbytes
+    def look(frame_id: str) -> Glance:
+        def load() -> tuple[Glance, int]:
+            found = glance(shelf.features_of(mission_id, frame_id).thumb)
+            return found, found.colours.nbytes + _OVERHEAD_BYTES
 
-        found: Pixels = _thumbs.get((mission_id, frame_id), load)
+        found: Glance = _glances.get((mission_id, frame_id), load)
         return found
 
-    return thumb
+    return look
 
 
 def again(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:

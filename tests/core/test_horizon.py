@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from core.geometry import Array, Camera, Pose, World
+from core.glance import glance
 from core.horizon import shows_sky
 from core.mosaic import lay_out
 from core.pose_graph import Solution
@@ -49,6 +50,6 @@ def test_only_a_photo_that_ties_to_nothing_is_left_out_for_its_sky() -> None:
     sky, ground = (p.clip(0, 255).astype(np.uint8) for p in (_horizon(), _ground()))
     thumbs = {"tied": sky, "untied": sky, "field": ground}
     solution = Solution(World(47.0, 15.0), {"c": camera}, poses, {}, 0.0)
-    layout = lay_out(solution, dict.fromkeys(poses, "c"), thumbs.__getitem__, None)
+    layout = lay_out(solution, dict.fromkeys(poses, "c"), lambda k: glance(thumbs[k]), None)
     assert layout.frames.keys() == {"tied", "field"}
     assert layout.rejected == {"untied": "oblique"}

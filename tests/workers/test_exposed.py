@@ -9,6 +9,7 @@ import pytest
 
 from core.coverage import tiles_under
 from core.geometry import Camera, Pose, PosedFrame, World
+from core.glance import Glance, glance
 from core.matching import MatchCounts, PairMatch
 from core.mosaic import Layout
 from workers.posing import EXPOSED_BY, exposed
@@ -31,7 +32,7 @@ def layout() -> Layout:
     return Layout(WORLD, ZOOM, {"camera": CAMERA}, frames, under, {})
 
 
-def thumb(name: str) -> np.ndarray:
+def look(name: str) -> Glance:
     """The same waves on the ground, under each photo's own light."""
     us, vs = np.meshgrid((np.arange(128) + 0.5) * 12.5 - 0.5, (np.arange(96) + 0.5) * 12.5 - 0.5)
     at = layout().frames[name]
@@ -39,7 +40,7 @@ def thumb(name: str) -> np.ndarray:
     grey = 115 + 40 * np.sin(x / 9) * np.cos(y / 7)
     light = grey / (256 - grey) * LIGHTS[name]
     shown = (256 * light / (1 + light)).astype(np.uint8).reshape(96, 128, 1)
-    return np.repeat(shown, 3, axis=2)
+    return glance(np.repeat(shown, 3, axis=2))
 
 
 def match(low: str, high: str, points: int) -> PairMatch:
@@ -52,7 +53,7 @@ def match(low: str, high: str, points: int) -> PairMatch:
 )
 def test_it_is_as_bright_as_its_neighbours(matches: list[PairMatch]) -> None:
     before = layout()
-    after = exposed(before, {"new"}, matches, thumb)
+    after = exposed(before, {"new"}, matches, look)
     assert after.frames["new"].gain == pytest.approx((1 / LIGHTS["new"],) * 3, rel=0.02)
     assert {k: f for k, f in after.frames.items() if k != "new"} == {
         k: f for k, f in before.frames.items() if k != "new"
@@ -62,7 +63,7 @@ def test_it_is_as_bright_as_its_neighbours(matches: list[PairMatch]) -> None:
 def test_few_are_looked_at_and_those_that_it_matches_best() -> None:
     asked: list[str] = []
     matches = [match(k, "new", n) for n, k in enumerate("abcd", 20)]
-    exposed(layout(), {"new"}, matches, lambda k: (asked.append(k), thumb(k))[1])
+    exposed(layout(), {"new"}, matches, lambda k: (asked.append(k), look(k))[1])
     assert sorted(asked) == ["b", "c", "d", "new"]
     assert len(asked) == EXPOSED_BY + 1
 
@@ -70,5 +71,5 @@ def test_few_are_looked_at_and_those_that_it_matches_best() -> None:
 def test_a_frame_that_could_not_be_placed_is_nobodys() -> None:
     before = layout()
     alone = replace(before, frames={"new": before.frames["new"]})
-    assert exposed(before, {"lost"}, [], thumb).frames == before.frames
-    assert exposed(alone, {"new"}, [], thumb).frames["new"].gain == (1.0, 1.0, 1.0)
+    assert exposed(before, {"lost"}, [], look).frames == before.frames
+    assert exposed(alone, {"new"}, [], look).frames["new"].gain == (1.0, 1.0, 1.0)
