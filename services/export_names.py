@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from typing import Literal, get_args
 
 from pyproj import CRS
 from pyproj.exceptions import CRSError
@@ -15,7 +14,7 @@ MOSAIC = "mosaic.tif"
 MAKING = "making-"
 """Begins the names of the folders in which they are made."""
 
-ExportName = Literal[
+NAMES: tuple[str, ...] = (
     "mosaic.tif",
     "preview.png",
     "preview.zip",
@@ -28,8 +27,7 @@ ExportName = Literal[
     "poses.json",
     "route.csv",
     "report.json",
-]
-NAMES: tuple[str, ...] = get_args(ExportName)
+)
 
 _MOSAIC_IN_CRS = re.compile(r"mosaic\.epsg(\d{4,6})\.tif")
 

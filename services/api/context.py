@@ -26,8 +26,8 @@ _MISSION_ID = re.compile(r"[a-z0-9]{1,40}")
 class Send(Protocol):
     """Wakes a worker by the name of its task; False when the broker is away (the sweep sends it again)."""
 
-    def __call__(self, name: str, /, *args: Any) -> bool:
-        """`args` must be JSON."""
+    def __call__(self, name: str, /, *args: Any, priority: int | None = None) -> bool:
+        """`args` must be JSON. `priority`: where not the task's own, 0 goes first."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,6 +64,12 @@ class ExportFailed(OrthostreamError):
     code = "export_failed"
 
 
+class ExportNotFound(NotFound):
+    """There is no such file to be had of a mission."""
+
+    code = "export_not_found"
+
+
 class RevisionGone(NotFound):
     """The mission has not been published under that revision."""
 

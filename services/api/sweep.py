@@ -15,6 +15,7 @@ import structlog
 from services.catalog import missions, standstill
 from services.database import Database
 from services.export_names import MAKING
+from services.queue import PRIORITIES
 from services.settings import Settings
 from services.storage import ObjectStore
 
@@ -48,7 +49,9 @@ class Sweep:
         with self._db.write() as tx:
             stalled = standstill.stalled(tx, self._settings.stalled_after_s)
         for wake in stalled:
-            self._send(wake.task, *wake.args)
+            # A file that was asked for long ago waits for no more photos, however many are still coming.
+            first = {"priority": PRIORITIES["match"]} if wake.task == "export" else {}
+            self._send(wake.task, *wake.args, **first)
         with self._db.read() as tx:
             deleted = missions.deleting(tx)
         for mission_id in deleted:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 
 from services.api.context import MissionId, PublicUrl, Services, Use
+from services.api.etags import has
 from services.api.problems import NotDrawnYet, RevisionGone
 from services.catalog import missions, tiles
 from services.catalog.tiles import StoredTile, TileBox
@@ -95,14 +96,9 @@ def _answer(services: Services, tile: StoredTile | None, request: Request, cache
     if tile is None or tile.object_key is None:
         return Response(status_code=204, headers=headers)
     headers["ETag"] = f'"{tile.etag or tile.revision}"'
-    if _has(request, headers["ETag"]):
+    if has(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     return Response(services.store.get(tile.object_key), media_type=tile.media_type, headers=headers)
-
-
-def _has(request: Request, etag: str) -> bool:
-    offered = request.headers.get("if-none-match", "")
-    return offered.strip() == "*" or etag in (e.strip().removeprefix("W/") for e in offered.split(","))
 
 
 def _bounds_deg(box: TileBox) -> tuple[float, float, float, float]:

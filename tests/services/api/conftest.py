@@ -16,6 +16,7 @@ from PIL import Image
 
 from services.api.app import create_app
 from services.api.context import Services
+from services.queue import PRIORITIES
 from services.settings import Settings
 
 
@@ -24,11 +25,13 @@ class Sent:
     """Stands where the broker does: the wake-ups in the order they were sent."""
 
     tasks: list[tuple[Any, ...]] = field(default_factory=list)
+    priorities: list[int] = field(default_factory=list)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def __call__(self, name: str, /, *args: Any) -> bool:
+    def __call__(self, name: str, /, *args: Any, priority: int | None = None) -> bool:
         with self.lock:
             self.tasks.append((name, *args))
+            self.priorities.append(PRIORITIES[name] if priority is None else priority)
         return True
 
 

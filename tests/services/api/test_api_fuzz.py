@@ -48,7 +48,9 @@ CASES = [
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[asgi.ASGIClient]:
     folder: Path = tmp_path_factory.mktemp("fuzz")
-    app = create_app(Settings(data_dir=folder, min_free_bytes=0, sweep_s=3600), lambda name, *args: True)
+    app = create_app(
+        Settings(data_dir=folder, min_free_bytes=0, sweep_s=3600), lambda name, *args, priority=None: True
+    )
     with asgi.get_client(app) as client:
         yield client
 
