@@ -20,9 +20,10 @@ from pmtiles.writer import Writer
 
 from core.errors import NothingToMap
 from core.grid import TILE_PX, TileKey, tile_bounds_lonlat
-from core.pyramid import JPEG, WEBP
+from core.pyramid import JPEG, PNG, WEBP
 
-SUFFIX = {JPEG: "jpg", WEBP: "webp"}
+SUFFIX = {JPEG: "jpg", WEBP: "webp", PNG: "png"}
+_PMTILES = {JPEG: TileType.JPEG, WEBP: TileType.WEBP, PNG: TileType.PNG}
 
 # What a zip can say at the least: no date may depend on when it was written.
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -63,8 +64,9 @@ class TileSet:
 
     @property
     def kind(self) -> str:
-        """The one media type to announce: who can show WebP can show JPEG too, the reverse is not sure."""
-        return WEBP if WEBP in self.kinds.values() else JPEG
+        """The one media type to announce: who can show WebP can show the others, the reverse is not sure."""
+        found = set(self.kinds.values())
+        return next(kind for kind in (WEBP, PNG, JPEG) if kind in found)
 
     def native(self) -> list[TileKey]:
         """The tiles of the finest zoom, sorted."""
@@ -88,7 +90,7 @@ def write_pmtiles(path: Path, tiles: TileSet) -> None:
     west, south, east, north = tiles.bounds()
     lon, lat, zoom = tiles.center()
     header = {
-        "tile_type": TileType.WEBP if tiles.kind == WEBP else TileType.JPEG,
+        "tile_type": _PMTILES[tiles.kind],
         "tile_compression": Compression.NONE,
         "min_lon_e7": _e7(west),
         "min_lat_e7": _e7(south),

@@ -22,7 +22,7 @@ from core.grid import (
     zoom_resolution_m,
 )
 from core.outline import ground_outline
-from core.pyramid import Rgba, decode, encode, halve
+from core.pyramid import Rgba, TileFormat, decode, encode, halve
 
 FUSION = FusionParams()
 USUAL_SIDE_PX, MOST_BANDS = 1600, 6
@@ -121,6 +121,7 @@ def draw_block(
     frames: Sequence[PosedFrame] | FrameIndex,
     photos: Photos,
     params: FusionParams = FUSION,
+    tile_format: TileFormat = "jpeg",
 ) -> dict[TileKey, Encoded | None]:
     """The tiles' encoded pictures, drawn together; None for those on which nothing is known."""
     grid = block_grid(tiles)
@@ -129,7 +130,8 @@ def draw_block(
     drawn: dict[TileKey, Encoded | None] = {}
     for tile in tiles:
         top, left = tile.y * TILE_PX - grid.row0, tile.x * TILE_PX - grid.col0
-        drawn[tile] = encode(np.ascontiguousarray(picture[top : top + TILE_PX, left : left + TILE_PX]))
+        pixels = np.ascontiguousarray(picture[top : top + TILE_PX, left : left + TILE_PX])
+        drawn[tile] = encode(pixels, tile_format)
     return drawn
 
 
@@ -146,7 +148,7 @@ def quarter(data: bytes) -> Rgba:
     return halve(decode(data))
 
 
-def overview(quarters: Sequence[Rgba | None]) -> Encoded | None:
+def overview(quarters: Sequence[Rgba | None], tile_format: TileFormat = "jpeg") -> Encoded | None:
     """An overview's encoded picture from its children's quarters (NW, NE, SW, SE; None = nothing known).
 
     The same as `core.pyramid.reduce` of the children, but children that did not change need no work.
@@ -158,17 +160,18 @@ def overview(quarters: Sequence[Rgba | None]) -> Encoded | None:
         if picture is not None:
             row, col = divmod(k, 2)
             canvas[row * TILE_PX // 2 :, col * TILE_PX // 2 :][: TILE_PX // 2, : TILE_PX // 2] = picture
-    return encode(canvas)
+    return encode(canvas, tile_format)
 
 
-def pyramid(natives: Mapping[TileKey, bytes]) -> dict[TileKey, bytes]:
+def pyramid(natives: Mapping[TileKey, bytes], tile_format: TileFormat = "jpeg") -> dict[TileKey, bytes]:
     """All overviews of native tiles (of one zoom), from their encoded pictures."""
     tiles = dict(natives)
     if not tiles:
         return {}
     above: dict[TileKey, bytes] = {}
     for tile in ancestors(tiles, top_zoom(tiles)):
-        encoded = overview([quarter(tiles[c]) if c in tiles else None for c in children(tile)])
+        quarters = [quarter(tiles[c]) if c in tiles else None for c in children(tile)]
+        encoded = overview(quarters, tile_format)
         if encoded is not None:
             tiles[tile] = above[tile] = encoded[0]
     return above

@@ -12,7 +12,7 @@ import numpy as np
 from core.fusion import FusionParams
 from core.geometry import PosedFrame, World
 from core.grid import TileKey
-from core.pyramid import QUALITY
+from core.pyramid import QUALITY, TileFormat
 
 LOOK = 4
 """Raised whenever the same frames would be drawn or encoded otherwise than before."""
@@ -27,13 +27,19 @@ def frame_digest(frame: PosedFrame) -> bytes:
 
 
 def tile_inputs(
-    tile: TileKey, world: World, max_side: int | None, frames: Iterable[bytes], params: FusionParams
+    tile: TileKey,
+    world: World,
+    max_side: int | None,
+    frames: Iterable[bytes],
+    params: FusionParams,
+    tile_format: TileFormat = "jpeg",
 ) -> str:
     """32 hex digits for a tile drawn from these frames (`frame_digest` of each), whatever their order.
 
     `max_side`: the longest side, in pixels, at which the photos are drawn.
     """
-    digest = sha256(repr((LOOK, QUALITY, tuple(tile), max_side, params)).encode())
+    how = (LOOK, tile_format, QUALITY, tuple(tile), max_side, params)
+    digest = sha256(repr(how).encode())
     for part in (*_parts(world), *sorted(frames)):
         digest.update(part)
     return digest.hexdigest()[:32]

@@ -35,6 +35,7 @@ from core.metadata import read_metadata
 from core.neighbours import Pair, Sighting
 from core.photo import probe
 from core.pose_graph import GraphFrame, PoseParams, Solution, solve
+from core.pyramid import TileFormat
 from core.scale import UNKNOWN, KnownScale, named
 from core.submaps import SubmapGraph, submap_graph
 from core.ties import Canonical, canonical
@@ -189,6 +190,7 @@ def build(
     max_side: int | None = None,
     mode: str = "visual",
     scale: KnownScale = UNKNOWN,
+    tile_format: TileFormat = "jpeg",
 ) -> Mosaic:
     """The map of some photos (name, bytes), whatever their order. `mode`: visual or gnss."""
     rejected: dict[str, str] = {}
@@ -212,7 +214,7 @@ def build(
     solution, submaps = solved(frames, wanted, scale)
     camera_keys = {k: r.frame.meta.camera_key for k, r in read.items()}
     layout = lay_out(solution, camera_keys, lambda k: glance(read[k].features.thumb), max_side, mode=mode)
-    tiles = draw(layout, _Photos(read, max_side))
+    tiles = draw(layout, _Photos(read, max_side), tile_format)
     return Mosaic(solution, layout, tiles, rejected | dict(layout.rejected), submaps)
 
 
@@ -239,14 +241,14 @@ def _scaled(scale: KnownScale, frames: Sequence[GraphFrame]) -> PoseParams:
     return PoseParams(ground_px_per_m=scale.marker.ground_px_per_m, scale_image=photo or scale.marker.image)
 
 
-def draw(layout: Layout, photos: _Photos) -> dict[TileKey, bytes]:
+def draw(layout: Layout, photos: _Photos, tile_format: TileFormat = "jpeg") -> dict[TileKey, bytes]:
     """Every tile that shows something, overviews included."""
     index = FrameIndex(layout.frames.values(), layout.fusion)
     natives: dict[TileKey, bytes] = {}
     for block in blocks(layout.cover):
-        drawn = draw_block(block, layout.world, index, photos, layout.fusion)
+        drawn = draw_block(block, layout.world, index, photos, layout.fusion, tile_format)
         natives |= {tile: encoded[0] for tile, encoded in drawn.items() if encoded is not None}
-    return natives | pyramid(natives)
+    return natives | pyramid(natives, tile_format)
 
 
 def _matched(low: _Read, high: _Read) -> PairMatch:

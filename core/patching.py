@@ -19,7 +19,7 @@ from core.coverage import FUSION, Encoded, block_grid
 from core.fusion import FrameIndex, FusionParams, Photos, render
 from core.geometry import Array, PosedFrame, World
 from core.grid import TILE_PX, MercatorGrid, TileKey
-from core.pyramid import Rgba, encode
+from core.pyramid import Rgba, TileFormat, encode
 
 CELL_PX = 16
 FADE_PX = 16
@@ -45,6 +45,7 @@ def fill_block(
     frames: FrameIndex,
     photos: Photos,
     params: FusionParams = LIVE,
+    tile_format: TileFormat = "jpeg",
 ) -> Patched:
     """Draws what these neighbouring tiles of one zoom do not show yet. `shown`: their pictures so far."""
     grid = block_grid(list(shown))
@@ -60,7 +61,7 @@ def fill_block(
     places = {tile: _place(grid, tile) for tile in shown}
     fresh = _pixels(drawn)
     changed = [tile for tile, place in places.items() if fresh[place].any()]
-    encoded = {tile: encode(np.ascontiguousarray(canvas[places[tile]])) for tile in changed}
+    encoded = {tile: encode(np.ascontiguousarray(canvas[places[tile]]), tile_format) for tile in changed}
     return Patched(encoded, int(drawn.sum()) * CELL_PX**2)
 
 

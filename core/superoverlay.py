@@ -12,7 +12,7 @@ from PIL import Image
 
 from core.archives import TileSet, write_zip
 from core.grid import EQUATOR_M, TILE_PX, TileKey, children, tile_bounds_lonlat
-from core.pyramid import JPEG, decode
+from core.pyramid import JPEG, WEBP, decode
 
 KML = "http://www.opengis.net/kml/2.2"
 _SIDES = ("north", "south", "east", "west")
@@ -22,7 +22,7 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 def write_kmz(path: Path, tiles: TileSet) -> None:
     """A KMZ at `path`: one small KML and one picture a tile, each naming the finer ones below it.
 
-    JPEG tiles are in it byte for byte. Google Earth knows no WebP: those are PNG of the same pixels.
+    JPEG and PNG tiles are in it byte for byte. Google Earth knows no WebP: those are PNG of the same pixels.
     Between its parallels a picture is shown as if degrees, not mercator metres, were even: 0.1 px off where a
     tile is 10 km high, less below.
     """
@@ -46,7 +46,7 @@ def _picture_name(tiles: TileSet, tile: TileKey) -> str:
 
 def _picture(tiles: TileSet, tile: TileKey) -> bytes:
     data = tiles.read(tile)
-    if tiles.kinds[tile] == JPEG:
+    if tiles.kinds[tile] != WEBP:
         return data
     out = io.BytesIO()
     # A third of the time of the default level for a seventh more bytes.

@@ -49,6 +49,7 @@ class Settings(BaseSettings):
     min_free_bytes: int = Field(default=500_000_000, ge=0)
     photo_cache_bytes: int = Field(default=80_000_000, ge=0)
     tile_cache_bytes: int = Field(default=32_000_000, ge=0)
+    tile_format: Literal["jpeg", "png"] = "jpeg"
 
     lease_ttl_s: float = Field(default=10.0, gt=0)
     sweep_s: float = Field(default=5.0, gt=0)

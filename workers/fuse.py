@@ -65,7 +65,9 @@ class _Sight:
             if frame.frame_id not in self.digests:
                 self.digests[frame.frame_id] = frame_digest(frame)
         digests = [self.digests[f.frame_id] for f in around]
-        return tile_inputs(tile, self.known.world, self.mission.tile_side, digests, self.fusion)
+        return tile_inputs(
+            tile, self.known.world, self.mission.tile_side, digests, self.fusion, settings.tile_format
+        )
 
 
 @stage("fuse")
@@ -164,7 +166,7 @@ def _redrawn(
     left = [tile for tile in block if tile not in {TileKey(*r.key) for r in done}]
     if not left:
         return done, 0
-    found = draw_block(left, world, sight.index, sight.photos, sight.fusion)
+    found = draw_block(left, world, sight.index, sight.photos, sight.fusion, settings.tile_format)
     put = [putting(store, mission.id, wanted[t].generation, t, p, inputs[t]) for t, p in found.items()]
     if len(left) == len(wanted) and mission.final_generation is not None:
         made = _with_above(mission.id, put, found)
@@ -180,7 +182,8 @@ def _with_above(
     """Siblings, all of which were drawn now, with their overview on one of them: publish finds it ready."""
     above = parent(next(iter(found)))
     encoded = [found.get(child) for child in children(above)]
-    picture = overview([None if e is None else quarter(e[0]) for e in encoded])
+    quarters = [None if e is None else quarter(e[0]) for e in encoded]
+    picture = overview(quarters, settings.tile_format)
     over = putting(store, mission_id, 0, above, picture).result()
     made = [begun.result() for begun in put]
     pictures_of = {TileKey(*r.key): r.object_key for r in made if r.object_key is not None}
@@ -201,7 +204,7 @@ def _filled(
     mission, world = sight.mission, sight.known.world
     assert world is not None
     shown = {tile: pictures.get(_key(wanted[tile].shown)) for tile in block}
-    patched = fill_block(shown, world, sight.index, sight.photos)
+    patched = fill_block(shown, world, sight.index, sight.photos, tile_format=settings.tile_format)
     put = [putting(store, mission.id, wanted[t].generation, t, p) for t, p in patched.changed.items()]
     kept = [_as_shown(tile, wanted[tile]) for tile in block if tile not in patched.changed]
     return [*kept, *(begun.result() for begun in put)], patched.pixels

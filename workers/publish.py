@@ -137,7 +137,7 @@ def _overviews(
             picture = above.object_key, above.etag, above.media_type, above.size_bytes
             made[tile] = Render(tile, generation, *picture)
         else:
-            picture_of = overview([quarters.get(key) for key in of])
+            picture_of = overview([quarters.get(key) for key in of], settings.tile_format)
             put[tile] = putting(store, mission_id, generation, tile, picture_of)
     return made | {tile: begun.result() for tile, begun in put.items()}
 

@@ -26,8 +26,8 @@ _FOR_EVER = "public, max-age=31536000, immutable"
 _PICTURE = {"schema": {"type": "string", "format": "binary"}}
 _ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "JPEG where opaque, else WebP",
-        "content": {"image/jpeg": _PICTURE, "image/webp": _PICTURE},
+        "description": "JPEG where opaque, else WebP; or all PNG, as the service is set",
+        "content": {"image/jpeg": _PICTURE, "image/webp": _PICTURE, "image/png": _PICTURE},
     },
     204: {"description": "Nothing to see there"},
     304: {"description": "The one you have is the newest"},

@@ -45,7 +45,8 @@ EPSG = 32632
 
 def of_bytes(tiles: Mapping[TileKey, bytes], title: str = "A flood") -> TileSet:
     """A tile set whose media types are seen from the bytes."""
-    kinds = {t: pyramid.JPEG if data[:2] == b"\xff\xd8" else pyramid.WEBP for t, data in tiles.items()}
+    by_magic = {b"\xff\xd8": pyramid.JPEG, b"\x89P": pyramid.PNG}
+    kinds = {t: by_magic.get(data[:2], pyramid.WEBP) for t, data in tiles.items()}
     return TileSet(title, kinds, lambda t: tiles[t])
 
 
@@ -101,7 +102,9 @@ def tile_sets(draw: st.DrawFn) -> dict[TileKey, bytes]:
             max_size=40,
         )
     )
-    pictures = st.builds(bytes.__add__, st.sampled_from([b"\xff\xd8", b"RIFF"]), st.binary(max_size=6))
+    pictures = st.builds(
+        bytes.__add__, st.sampled_from([b"\xff\xd8", b"RIFF", b"\x89PNG"]), st.binary(max_size=6)
+    )
     return {key: draw(pictures) for key in keys}
 
 
@@ -130,6 +133,24 @@ def test_equal_tiles_give_equal_archives(name: str, tmp_path: Path, tiles: dict[
         WRITERS[name](path, of_bytes(dict(shuffled)))
         written.append(path.read_bytes())
     assert written[0] == written[1] == written[2]
+
+
+def test_a_map_of_png_tiles_says_so_and_goes_to_google_earth_as_it_is(
+    tmp_path: Path, tiles: dict[TileKey, bytes]
+) -> None:
+    lossless = {
+        t: encoded[0] for t, d in tiles.items() if (encoded := pyramid.encode(pyramid.decode(d), "png"))
+    }
+    for name, write in WRITERS.items():
+        write(tmp_path / name, of_bytes(lossless))
+    with (tmp_path / "tiles.pmtiles").open("rb") as file:
+        assert Reader(MmapSource(file)).header()["tile_type"] == TileType.PNG
+    with sqlite3.connect(tmp_path / "tiles.mbtiles") as db:
+        assert db.execute("SELECT value FROM metadata WHERE name = 'format'").fetchone() == ("png",)
+    with zipfile.ZipFile(tmp_path / "tiles.zip") as folder, zipfile.ZipFile(tmp_path / "map.kmz") as kmz:
+        for tile, data in lossless.items():
+            name = f"{tile.z}/{tile.x}/{tile.y}.png"
+            assert folder.read(name) == kmz.read(name) == data
 
 
 @pytest.mark.parametrize("name", WRITERS)

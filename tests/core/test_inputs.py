@@ -52,6 +52,7 @@ def test_a_tiles_inputs_are_a_function_of_the_set_of_its_frames():
         tile_inputs(TILE, replace(WORLD, alt_m=401.0), 1600, [one, two], PARAMS),
         tile_inputs(TILE, WORLD, None, [one, two], PARAMS),
         tile_inputs(TILE, WORLD, 1600, [one, two], replace(PARAMS, bands=3)),
+        tile_inputs(TILE, WORLD, 1600, [one, two], PARAMS, "png"),
     }
-    assert len(others) == 5
+    assert len(others) == 6
     assert both not in others

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.pyramid import JPEG, WEBP, decode, encode, halve, reduce
+from core.pyramid import JPEG, PNG, WEBP, decode, encode, halve, reduce
 
 Rgba = NDArray[np.uint8]
 
@@ -76,6 +76,17 @@ def test_opaque_is_jpeg_and_the_rest_webp() -> None:
         seen = ragged[..., 3] > 0
         assert np.abs(back[..., :3].astype(int) - ragged[..., :3])[seen].mean() < 5
     assert encode(np.zeros((512, 512, 4), np.uint8)) is None
+
+
+@pytest.mark.parametrize("alpha", ["opaque", "edge"])
+def test_png_loses_nothing_and_half_of_it_is_half_of_the_picture(alpha: str) -> None:
+    picture = tile(4, alpha)
+    data, kind = encode(picture, "png") or (b"", "")
+    assert (kind, data[:4]) == (PNG, b"\x89PNG")
+    assert (decode(data) == picture).all()
+    assert (data, kind) == encode(picture.copy(), "png")
+    assert (halve(decode(data)) == halve(picture)).all()
+    assert encode(np.zeros_like(picture), "png") is None
 
 
 def test_one_visible_pixel_is_enough() -> None:

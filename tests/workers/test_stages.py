@@ -6,11 +6,13 @@ import random
 from io import BytesIO
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from core.errors import TruncatedImage
 from core.mosaic import Mosaic, build, frame_id_of
+from core.pyramid import PNG, decode
 from core.simulation import FlightParams
 from services.catalog import backlog, exports, frames, leases, missions, pairs, poses, tiles
 from services.errors import LeaseLost, OutOfDisk
@@ -50,6 +52,29 @@ def test_shuffled_and_repeated_tasks_end_in_the_oracles_tiles(
     assert bench.state == "final"
     assert set(bench.frame_states().values()) == {"fused"}
     assert bench.tiles() == expected
+
+
+def test_tiles_are_png_by_setting_and_show_exactly_what_was_drawn(
+    bench: Any, photos: list[tuple[str, bytes]], oracle: Mosaic, expected: Tiles
+) -> None:
+    settings = bench.modules["app"].settings
+    assert settings.tile_format == "jpeg"
+    object.__setattr__(settings, "tile_format", "png")  # frozen for everybody else
+    try:
+        bench.upload(photos)
+        bench.drain()
+        bench.finalise()
+        bench.drain()
+    finally:
+        object.__setattr__(settings, "tile_format", "jpeg")
+    shown = bench.tiles()
+    assert shown == {tuple(k): v for k, v in build(photos, tile_format="png").tiles.items()}
+    assert shown.keys() == expected.keys()
+    with bench.db.read() as tx:
+        assert {t.media_type for t in tiles.current(tx, bench.mission_id, shown).values()} == {PNG}
+    zoom = oracle.layout.zoom
+    for key in [k for k in shown if k[0] == zoom]:
+        assert np.abs(decode(shown[key]).astype(int) - decode(expected[key])).mean() < 4
 
 
 def test_large_photos_end_in_the_oracles_tiles_too(
