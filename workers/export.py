@@ -31,6 +31,7 @@ from core.superoverlay import write_kmz
 from services.catalog import exports, frames, missions, poses, surveys, tiles
 from services.catalog.frames import Seen
 from services.catalog.poses import Poses
+from services.errors import OutOfDisk
 from services.export_names import MAKING, MOSAIC, crs_of
 from services.queue import send
 from services.report import report
@@ -38,7 +39,7 @@ from services.tables import Export, Mission
 from workers import surveyed
 from workers.app import Stopwatch, db, log, settings, stage, store
 from workers.photos import MissionPhotos, shelf
-from workers.pieces import SLICE_S, SharedMosaic, locked
+from workers.pieces import SLICE_S, SharedMosaic, check_room, locked
 
 MEDIA_TYPES = {
     ".tif": "image/tiff",
@@ -54,6 +55,8 @@ MEDIA_TYPES = {
 
 FOLDER = settings.exports_dir
 """Where files are while they are made."""
+
+NO_ROOM = "The server's disk has no room for this file. Free some space there, then ask for it again."
 
 Maker = Callable[[Path, Mission, Export], None]
 
@@ -76,18 +79,41 @@ def export(mission_id: str, name: str) -> None:
 
 
 def _make(mission: Mission, wanted: Export, clock: Stopwatch) -> None:
-    name = wanted.name
     try:
+        check_room(FOLDER, settings.min_free_bytes)
         key, size = _made(mission, wanted)
     except Exception as error:
+        with db.write() as tx:  # raises MissionNotFound when that is why
+            exports.fail(tx, mission.id, wanted.name, wanted.revision, _reason(error))
         if not isinstance(error, OrthostreamError):
-            log.exception("export failed", mission=mission.id, export=name)
-        with db.write() as tx:
-            exports.fail(tx, mission.id, name, wanted.revision, str(error) or type(error).__name__)
+            log.exception("export failed", mission=mission.id, export=wanted.name)
         return
-    with db.write() as tx:
-        exports.finish(tx, mission.id, name, wanted.revision, key, size, MEDIA_TYPES[Path(name).suffix])
-        clock.spend(tx, mission.id, "export")
+    _keep(mission, wanted, key, size, clock)
+
+
+def _reason(error: Exception) -> str:
+    """For people. GDAL and SQLite have many words for a full disk."""
+    try:
+        if not isinstance(error, OrthostreamError):
+            check_room(FOLDER, settings.min_free_bytes)
+    except OutOfDisk as full:
+        error = full
+    return NO_ROOM if isinstance(error, OutOfDisk) else str(error) or type(error).__name__
+
+
+def _keep(mission: Mission, wanted: Export, key: str, size: int, clock: Stopwatch) -> None:
+    """The row names the new file, and the one before goes: of a map that grows they would fill the disk."""
+    media_type = MEDIA_TYPES[Path(wanted.name).suffix]
+    before, named = wanted.object_key, wanted.object_key
+    try:
+        with db.write() as tx:
+            exports.finish(tx, mission.id, wanted.name, wanted.revision, key, size, media_type)
+            row = exports.get(tx, mission.id, wanted.name)
+            named = row.object_key if row else None
+            clock.spend(tx, mission.id, "export")
+    finally:
+        for left in {before, key} - {named, None}:
+            store.delete(str(left))
 
 
 def _help(mission: Mission, name: str, clock: Stopwatch) -> None:
@@ -107,7 +133,9 @@ def _made(mission: Mission, wanted: Export) -> tuple[str, int]:
     with TemporaryDirectory(dir=FOLDER, prefix=MAKING) as folder:
         path = Path(folder) / wanted.name
         make(path, mission, wanted)
-        key = f"missions/{mission.id}/exports/{wanted.revision}-{wanted.generation}/{wanted.name}"
+        # Never twice the same: a download that goes on elsewhere in a file must not find another one.
+        as_of = f"{wanted.revision}-{wanted.generation}-{wanted.requested_at:.3f}"
+        key = f"missions/{mission.id}/exports/{as_of}/{wanted.name}"
         size_bytes = os.stat(path).st_size
         store.put_file(key, path, move=True)
         return key, size_bytes
@@ -151,7 +179,7 @@ def _shared(mission: Mission, name: str) -> SharedMosaic:
     plan = _plan(mission)
     photos = MissionPhotos(shelf, mission.id, mission.drawn_side)
     pieces = FOLDER / f"{mission.id}-{name}.{plan.digest()}-{mission.drawn_side}"
-    return SharedMosaic(plan, photos, pieces, settings.workers)
+    return SharedMosaic(plan, photos, pieces, settings.workers, settings.min_free_bytes)
 
 
 def _plan(mission: Mission) -> MosaicPlan:
@@ -218,7 +246,12 @@ def _tiles(mission: Mission, wanted: Export) -> TileSet:
     with db.read() as tx:
         local = poses.georeferenced(tx, mission.id) is False
     title = f"{mission.name} (not georeferenced)" if local else mission.name
-    return TileSet(title, kinds, lambda tile: store.get(keys[tile]))
+
+    def read(tile: TileKey) -> bytes:
+        check_room(FOLDER, settings.min_free_bytes)
+        return store.get(keys[tile])
+
+    return TileSet(title, kinds, read)
 
 
 def _archive(write: Callable[[Path, TileSet], None]) -> Maker:

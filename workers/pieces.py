@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from shutil import rmtree
+from shutil import disk_usage, rmtree
 from typing import BinaryIO
 
 from core.cog import MosaicPlan
 from core.fusion import Photos
+from services.errors import OutOfDisk
 
 SLICE_S = 2.0
 """Who helps looks up after this time: a photo may have come, and goes first."""
@@ -35,14 +36,24 @@ def locked(path: Path) -> Iterator[bool]:
             yield True
 
 
+def check_room(folder: Path, min_free_bytes: int) -> None:
+    """Raises OutOfDisk when what the disk must have left for photos and database has been reached."""
+    if disk_usage(folder).free < min_free_bytes:
+        raise OutOfDisk
+
+
 @dataclass(frozen=True, slots=True)
 class SharedMosaic:
-    """A mosaic of whose plan every helper makes up the same. `folder`: of its own, next to its claims."""
+    """A mosaic of whose plan every helper makes up the same. `folder`: of its own, next to its claims.
+
+    `min_free_bytes`: what drawing leaves free on its disk, or raises OutOfDisk.
+    """
 
     plan: MosaicPlan
     photos: Photos
     folder: Path
     hands: int
+    min_free_bytes: int = 0
 
     def begin(self) -> None:
         """From now on others can help, beginning with what somebody has drawn who was killed."""
@@ -72,6 +83,7 @@ class SharedMosaic:
 
     def _draw(self, k: int) -> None:
         piece = self.plan.pieces()[k]
+        check_room(self.folder.parent, self.min_free_bytes)
         if not self.plan.is_drawn(piece, self.folder):  # by whoever had the claim a moment ago
             self.plan.draw(piece, self.photos, self.folder)
 
