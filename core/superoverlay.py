@@ -16,6 +16,7 @@ from core.pyramid import JPEG, WEBP, decode
 
 KML = "http://www.opengis.net/kml/2.2"
 _SIDES = ("north", "south", "east", "west")
+_LOD_PX = TILE_PX // 2
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -72,8 +73,12 @@ def _range_m(tiles: TileSet) -> float:
 
 
 def _page(tiles: TileSet, tile: TileKey) -> bytes:
-    """One tile's picture, over coarser ones, and links to those of its children that there are."""
+    """One tile's picture, over coarser ones, and links to those of its children that there are.
+
+    It says its region itself, as the link to it does: GDAL, and with it QGIS, reads a page only so.
+    """
     kml, document = _document(_name(tile))
+    _region(document, tile, 0 if tile.z == tiles.zooms[0] else _LOD_PX)
     overlay = ET.SubElement(document, "GroundOverlay")
     _values(overlay, drawOrder=str(tile.z))
     icon = ET.SubElement(overlay, "Icon")
@@ -81,7 +86,7 @@ def _page(tiles: TileSet, tile: TileKey) -> bytes:
     _box(ET.SubElement(overlay, "LatLonBox"), tile)
     for child in children(tile):
         if child in tiles.kinds:
-            _link(document, child, f"../../{_name(child)}.kml", min_lod_px=TILE_PX // 2)
+            _link(document, child, f"../../{_name(child)}.kml", min_lod_px=_LOD_PX)
     return _bytes(kml)
 
 
@@ -96,11 +101,15 @@ def _link(document: ET.Element, tile: TileKey, href: str, min_lod_px: int) -> No
     """Have `href` loaded once the tile's ground is `min_lod_px` wide on the screen."""
     link = ET.SubElement(document, "NetworkLink")
     _values(link, name=_name(tile))
-    region = ET.SubElement(link, "Region")
+    _region(link, tile, min_lod_px)
+    _values(ET.SubElement(link, "Link"), href=href, viewRefreshMode="onRegion")
+
+
+def _region(element: ET.Element, tile: TileKey, min_lod_px: int) -> None:
+    region = ET.SubElement(element, "Region")
     _box(ET.SubElement(region, "LatLonAltBox"), tile)
     # Without an upper end: what is coarser stays below, where finer tiles are missing or not there yet.
     _values(ET.SubElement(region, "Lod"), minLodPixels=str(min_lod_px), maxLodPixels="-1")
-    _values(ET.SubElement(link, "Link"), href=href, viewRefreshMode="onRegion")
 
 
 def _box(element: ET.Element, tile: TileKey) -> None:

@@ -294,6 +294,21 @@ def _covers(outer: tuple[float, ...], inner: tuple[float, ...]) -> bool:
     return outer[0] <= inner[0] and outer[1] <= inner[1] and outer[2] >= inner[2] and outer[3] >= inner[3]
 
 
+def test_gdal_sees_the_kmz_where_the_map_is(tmp_path: Path, tiles: dict[TileKey, bytes]) -> None:
+    """QGIS opens it by GDAL: every tile at its place, and nothing where there is none."""
+    write_kmz(tmp_path / "map.kmz", of_bytes(tiles))
+    hole = TileKey(ZOOM, X0 + 3, Y0 + 1)
+    with rasterio.open(tmp_path / "map.kmz") as raster:
+        assert raster.crs.to_epsg() == 4326
+        for tile in [hole, *(t for t in tiles if t.z == ZOOM)]:
+            west, south, east, north = tile_bounds_lonlat(tile)
+            (seen,) = raster.sample([(0.3 * west + 0.7 * east, 0.3 * south + 0.7 * north)])
+            if tile in tiles:
+                np.testing.assert_allclose(seen, [*colour(tile), 255], atol=6)
+            else:
+                assert seen[3] == 0
+
+
 @pytest.mark.parametrize("long_side_px", [2048, 700, 100])
 def test_the_world_file_puts_the_preview_where_the_tiles_are(
     tmp_path: Path, tiles: dict[TileKey, bytes], long_side_px: int
