@@ -7,7 +7,7 @@ whoever has the photos may draw any of them. GDAL puts them together.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -18,10 +18,10 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 from rasterio.enums import Resampling
-from rasterio.errors import CRSError
 from rasterio.vrt import WarpedVRT
 
-from core.errors import BadCrs, NothingToMap
+from core.crs import check_reach, checked_crs, transformation
+from core.errors import NothingToMap
 from core.fusion import DEFAULT as FUSION_DEFAULT
 from core.fusion import FrameIndex, FusionParams, Photos, render
 from core.geometry import Array, PosedFrame, World
@@ -29,7 +29,7 @@ from core.grid import UtmGrid, utm_epsg
 from core.inputs import LOOK, frame_digest
 from core.outline import ground_outline
 from core.pyramid import halve
-from core.virtual_raster import Patch, Virtual, write_virtual
+from core.virtual_raster import Patch, Virtual, keep_tags, write_virtual
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,19 +149,33 @@ class MosaicPlan:
         `crs`: what to warp it to, the UTM zone of the world's origin by default. The file appears whole or
         not at all. Raises BadCrs.
         """
-        target = checked_crs(crs)
+        target = self.checked_crs(crs)
         with (
             TemporaryDirectory(dir=path.parent, prefix=".mosaic-") as scratch,
             rasterio.Env(GDAL_CACHEMAX=self.params.cache_mb * 1_000_000),
         ):
-            whole = Path(scratch) / "whole.tif"
-            _pack(self._virtual(folder), whole, target, self.params)
+            whole, drawn = Path(scratch) / "whole.tif", self._virtual(folder)
+            if target is not None and target != (own := rasterio.CRS.from_epsg(self.grid.epsg)):
+                place = self.world.lon_deg, self.world.lat_deg
+                drawn = _warped(drawn, target, {"TRANSFORMATION": transformation(own, target, *place)})
+            _pack(drawn, whole, self.params)
             os.replace(whole, path)
+
+    def checked_crs(self, crs: str | None) -> rasterio.CRS | None:
+        """The CRS as GDAL knows it. Raises BadCrs where there is none, or none for where the map lies."""
+        target = checked_crs(crs)
+        if target is not None and not self.is_local:
+            check_reach(target, self.world.lon_deg, self.world.lat_deg)
+        return target
+
+    @property
+    def is_local(self) -> bool:
+        """Whether nobody knows where the map lies."""
+        return any(f.pose.source == "vision-only" for f in self.index.frames)
 
     def _virtual(self, folder: Path) -> Path:
         """The pieces in `folder` as one raster with overviews."""
-        local = any(f.pose.source == "vision-only" for f in self.index.frames)
-        tags = {"TIFFTAG_IMAGEDESCRIPTION": LOCAL, "GEOREFERENCED": "NO"} if local else {}
+        tags = {"TIFFTAG_IMAGEDESCRIPTION": LOCAL, "GEOREFERENCED": "NO"} if self.is_local else {}
         shown = [p for p in self.pieces() if (folder / _mark(p)).read_bytes() == SHOWS]
         rasters = []
         for level in range(self.levels):
@@ -193,6 +207,7 @@ def write_mosaic(
     """
     checked_crs(crs)
     plan = MosaicPlan.of(world, frames, gsd_m, params, fusion)
+    plan.checked_crs(crs)
     path.parent.mkdir(parents=True, exist_ok=True)
     pieces = plan.pieces()
     with TemporaryDirectory(dir=path.parent, prefix=".pieces-") as folder:
@@ -252,20 +267,19 @@ def _file(piece: Box, level: int) -> str:
     return f"{piece[0]}-{piece[1]}.{level}.tif"
 
 
-def checked_crs(crs: str | None) -> rasterio.CRS | None:
-    """What GDAL makes of it. Raises BadCrs."""
-    if crs is None:
-        return None
-    try:
-        with rasterio.Env():
-            return rasterio.CRS.from_user_input(crs)
-    except CRSError as error:
-        raise BadCrs(
-            f"{crs!r:.80} is not a coordinate reference system. Name one such as EPSG:32632."
-        ) from error
+def _warped(drawn: Path, crs: rasterio.CRS, tags: Mapping[str, str]) -> Path:
+    """Next to the drawn raster the same in another CRS, pixel by pixel when it is read."""
+    path = drawn.with_name("warped.vrt")
+    with (
+        rasterio.open(drawn) as source,
+        WarpedVRT(source, crs=crs, resampling=Resampling.bilinear) as warped,
+    ):
+        rasterio.shutil.copy(warped, path, driver="VRT")
+        keep_tags(path, source.tags() | tags)
+    return path
 
 
-def _pack(drawn: Path, whole: Path, crs: rasterio.CRS | None, params: MosaicParams) -> None:
+def _pack(drawn: Path, whole: Path, params: MosaicParams) -> None:
     """The drawn raster rearranged as a COG; GDAL's threads keep the order of the blocks."""
     options = {
         "driver": "COG",
@@ -279,8 +293,4 @@ def _pack(drawn: Path, whole: Path, crs: rasterio.CRS | None, params: MosaicPara
         "num_threads": str(params.threads),
     }
     with rasterio.open(drawn) as source:
-        if crs is None or crs == source.crs:
-            rasterio.shutil.copy(source, whole, **options)
-        else:
-            with WarpedVRT(source, crs=crs, resampling=Resampling.bilinear) as warped:
-                rasterio.shutil.copy(warped, whole, **options)
+        rasterio.shutil.copy(source, whole, **options)

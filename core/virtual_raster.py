@@ -53,9 +53,7 @@ def _dataset(raster: Virtual, overviews: Sequence[str]) -> ET.Element:
     root = ET.Element("VRTDataset", size)
     ET.SubElement(root, "SRS").text = raster.crs
     ET.SubElement(root, "GeoTransform").text = ",".join(map(repr, map(float, raster.transform.to_gdal())))
-    told = ET.SubElement(root, "Metadata")
-    for key, value in raster.tags.items():
-        ET.SubElement(told, "MDI", key=key).text = value
+    root.append(_metadata(raster.tags))
     for number, colour in enumerate(_BANDS, 1):
         band = ET.SubElement(root, "VRTRasterBand", dataType="Byte", band=str(number))
         ET.SubElement(band, "ColorInterp").text = colour
@@ -64,6 +62,22 @@ def _dataset(raster: Virtual, overviews: Sequence[str]) -> ET.Element:
         for patch in raster.patches:
             _place(band, patch, number)
     return root
+
+
+def keep_tags(path: Path, tags: Mapping[str, str]) -> None:
+    """Have a virtual raster that GDAL wrote say these too: a warped one forgets what its source said."""
+    tree = ET.parse(path)
+    root = tree.getroot()
+    assert root is not None
+    root.insert(0, _metadata(tags))
+    tree.write(path, "utf-8", xml_declaration=True)
+
+
+def _metadata(tags: Mapping[str, str]) -> ET.Element:
+    told = ET.Element("Metadata")
+    for key, value in sorted(tags.items()):
+        ET.SubElement(told, "MDI", key=key).text = value
+    return told
 
 
 def _place(band: ET.Element, patch: Patch, number: int) -> None:

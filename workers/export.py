@@ -165,6 +165,7 @@ def _is_mosaic(name: str) -> bool:
 
 def _mosaic(path: Path, mission: Mission, wanted: Export) -> None:
     mosaic = _shared(mission, wanted.name)
+    mosaic.plan.checked_crs(crs_of(wanted.name))  # before hours of work
     mosaic.begin()
     for _ in range(settings.workers - 1):
         send("export", mission.id, wanted.name)

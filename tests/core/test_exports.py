@@ -7,7 +7,9 @@ import hashlib
 import io
 import json
 import math
+import re
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -280,6 +282,21 @@ def test_another_crs_shows_the_same_places(tmp_path: Path) -> None:
     assert np.abs(pixels_of(warped, xy)[:, :3] - ground_colour(xy)).mean() < 2
 
 
+def test_another_crs_says_how_it_was_reached_and_keeps_what_else_was_said(tmp_path: Path) -> None:
+    """A map that lies nowhere lies nowhere in every CRS."""
+    with rasterio.open(write(tmp_path / "utm.tif")) as file:
+        assert {"TRANSFORMATION", "GEOREFERENCED"}.isdisjoint(file.tags())
+    with rasterio.open(write(tmp_path / "warped.tif", crs="EPSG:31254")) as file:
+        assert re.search("MGI .*: within [1-9].* m$", file.tags()["TRANSFORMATION"])
+    nowhere = [
+        replace(f, posed=replace(f.posed, pose=replace(f.posed.pose, source="vision-only"))) for f in FLIGHT
+    ]
+    for crs in (None, "EPSG:3857", "EPSG:2154"):
+        with rasterio.open(write(tmp_path / "local.tif", nowhere, crs=crs)) as file:
+            assert file.tags()["GEOREFERENCED"] == "NO"
+            assert "no photo has GPS" in file.tags()["TIFFTAG_IMAGEDESCRIPTION"]
+
+
 def test_progress_is_told_and_too_large_a_map_is_drawn_coarser(tmp_path: Path) -> None:
     told: list[float] = []
     path = write(
@@ -295,6 +312,9 @@ def test_progress_is_told_and_too_large_a_map_is_drawn_coarser(tmp_path: Path) -
 def test_what_cannot_be_drawn_says_so(tmp_path: Path) -> None:
     with pytest.raises(BadCrs, match="EPSG:99999"):
         write(tmp_path / "x.tif", crs="EPSG:99999")
+    with pytest.raises(BadCrs, match=r"New Zealand.*EPSG:32632"):
+        write(tmp_path / "x.tif", crs="EPSG:2193")
+    assert not list(tmp_path.iterdir())
     with pytest.raises(NothingToMap):
         write(tmp_path / "x.tif", [])
     with pytest.raises(NothingToMap):
