@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -25,6 +25,7 @@ from services.catalog.pairs import Key as PairKey
 from services.catalog.poses import Placed, Poses, PoseUpdate
 from services.catalog.tiles import GROWN, HEAL, NEW, Key, TileBox
 from services.tables import Frame
+from workers.homes import Homes
 from workers.shown import Shown
 
 SHOWN_MOVE_PX = 0.5
@@ -40,7 +41,7 @@ class Known:
     `solved_located`: frames with GPS in the last solve. `untried`: frames that have not looked for ties with
     other maps yet; `tries`: pairs that were asked for in order to tie maps and are still being matched.
     `tied`: maps were found to hang together since the last solve; `scale`: what that had for it.
-    `looked_at`, `with_fix`: what `located` goes by; `shown`: what `grown` does.
+    `located`: the frames that have GPS; `shown`: what `grown` goes by.
     """
 
     generation: int
@@ -53,26 +54,33 @@ class Known:
     tries: set[PairKey] = field(default_factory=set)
     tied: bool = False
     scale: Mapping[str, Any] | None = None
-    looked_at: set[str] = field(default_factory=set)
-    with_fix: set[str] = field(default_factory=set)
+    located: set[str] = field(init=False)
     shown: Shown | None = None
+    _homes: Homes | None = None
+
+    def __post_init__(self) -> None:
+        """Looks through the frames once."""
+        self.located = {k for k, f in self.seen.items() if _is_located(f)}
 
     @classmethod
     def read(cls, poses: Poses, sightings: Iterable[Seen], rms_px: float | None) -> Known:
         """From the rows alone, as another sequencer left them."""
         seen = {s.frame_id: GraphFrame(s.frame_id, s.name, s.meta) for s in sightings}
         known = cls(poses.generation, _layout(poses), poses.solved_frames, rms_px or 0.0, seen)
-        known.solved_located = len(known.located & poses.placed.keys())
+        known.solved_located = sum(k in known.located for k in poses.placed)
         return known
 
     def learn(self, new: Iterable[Frame]) -> None:
         """Take in the rows of frames that were matched."""
         fresh = (f for f in new if f.id not in self.seen)
-        self.seen |= {f.id: GraphFrame(f.id, f.name, FrameMeta.from_json(f.meta or {})) for f in fresh}
+        graph = {f.id: GraphFrame(f.id, f.name, FrameMeta.from_json(f.meta or {})) for f in fresh}
+        self.seen |= graph
+        self.located |= {k for k, f in graph.items() if _is_located(f)}
 
     def grown(self, after: Layout, new_ids: set[str]) -> dict[Key, int]:
         """The tiles that look different when the layout becomes that one, which has new frames besides."""
         assert self.layout is not None
+        self.homes.grow(after, new_ids)
         if new_ids & self.layout.frames.keys():
             return changed(self.layout, after).dirty(0)
         if self.shown is None or self.shown.layout is not self.layout:
@@ -87,7 +95,7 @@ class Known:
         return Solution(
             world=self.layout.world,
             cameras=self.layout.cameras,
-            poses={k: f.pose for k, f in self.layout.frames.items()},
+            poses=_PosesOf(self.layout.frames),
             unplaced={},
             reprojection_rms_px=self.reprojection_rms_px,
         )
@@ -98,26 +106,36 @@ class Known:
         return self.layout.waiting if self.layout else {}
 
     @property
-    def homes(self) -> dict[str, int | str]:
-        """Which connected map each frame is part of; one that ties to nothing is a map of its own."""
-        if self.layout is None:
-            return {}
-        poses = {k: f.pose for k, f in self.layout.frames.items()} | dict(self.layout.waiting)
-        return {k: k if p is None or p.source == "gnss" else p.submap for k, p in poses.items()}
-
-    @property
-    def located(self) -> set[str]:
-        """The frames that have GPS."""
-        for k in self.seen.keys() - self.looked_at:
-            self.looked_at.add(k)
-            if usable_fix(self.seen[k].meta.gps) is not None:
-                self.with_fix.add(k)
-        return self.with_fix
+    def homes(self) -> Homes:
+        """Which connected map each frame is part of."""
+        if self._homes is None or self._homes.layout is not self.layout:
+            self._homes = Homes(self.layout, self.located)
+        return self._homes
 
     @property
     def camera_keys(self) -> dict[str, str]:
         """Frame id → camera key."""
         return {k: f.meta.camera_key for k, f in self.seen.items()}
+
+
+class _PosesOf(Mapping[str, Pose]):
+    """The poses of some frames, without a copy of all."""
+
+    def __init__(self, frames: Mapping[str, PosedFrame]) -> None:
+        self._frames = frames
+
+    def __getitem__(self, frame_id: str) -> Pose:
+        return self._frames[frame_id].pose
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._frames)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+
+def _is_located(frame: GraphFrame) -> bool:
+    return usable_fix(frame.meta.gps) is not None
 
 
 def _layout(poses: Poses) -> Layout | None:
@@ -144,9 +162,9 @@ def joined(
     cameras = dict(layout.cameras) | {k: c for k, c in solution.cameras.items() if k not in layout.cameras}
     frames, under = dict(layout.frames), dict(layout.under)
     late = {k: pose for k, pose in waiting_frames(solution, mode).items() if k in new_ids}
-    lost = sorted(set(new_ids) - solution.poses.keys() - late.keys())
+    lost = sorted(k for k in new_ids if k not in solution.poses and k not in late)
     rejected = {k: solution.unplaced.get(k, errors.NotPlaceable.code) for k in lost}
-    for frame_id in sorted(set(new_ids) & set(solution.poses)):
+    for frame_id in sorted(k for k in new_ids if k in solution.poses):
         camera = cameras[keys[frame_id]]
         frame = PosedFrame(frame_id, camera, solution.poses[frame_id])
         tiles = frozenset(tiles_under(frame, layout.world, layout.zoom, layout.fusion))
@@ -241,12 +259,16 @@ def _off_px(old: PosedFrame, new: PosedFrame | None, before: Layout, after: Layo
 
 def lifts(known: Known, new_ids: set[str], matches: Iterable[PairMatch]) -> bool:
     """Whether new frames tie what has no place to a frame that GPS alone has placed so far."""
-    stuck = (known.waiting.keys() | new_ids) - known.located
-    if not stuck:
-        return False
-    fixed = (new_ids | {k for k, home in known.homes.items() if home == k}) & known.located
+    homes, located = known.homes, known.located
+
+    def stuck(k: str) -> bool:
+        return k not in located and (k in new_ids or k in known.waiting)
+
+    def fixed(k: str) -> bool:
+        return k in located and (k in new_ids or homes.get(k) == k)
+
     ends = [(m.low, m.high) for m in matches if m.accepted and new_ids & {m.low, m.high}]
-    return any((a in stuck and b in fixed) or (b in stuck and a in fixed) for a, b in ends)
+    return any((stuck(a) and fixed(b)) or (stuck(b) and fixed(a)) for a, b in ends)
 
 
 def everything(layout: Layout, published: Iterable[Key]) -> dict[Key, int]:

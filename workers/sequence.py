@@ -198,8 +198,7 @@ def _pose(mission: Mission, epoch: int, new: Sequence[Frame]) -> None:
         after, dirty, update = _solved_again(mission, known)
     else:
         assert before is not None
-        frames_here = [known.seen[k] for k in sorted(before.frames.keys() | new_ids)]
-        found = place(solution, frames_here, new_ids, matches)
+        found = place(solution, known.seen, new_ids, matches)
         keys = {k: known.seen[k].meta.camera_key for k in new_ids}
         grown = joined(before, found, new_ids, keys, mission.mode)
         after = exposed(grown, new_ids, matches, solving.glances(mission.id))
@@ -217,13 +216,14 @@ def _pose(mission: Mission, epoch: int, new: Sequence[Frame]) -> None:
 def _due(known: Known, new_ids: set[str], matches: Sequence[PairMatch]) -> bool:
     """Whether all is to be solved again instead of placing what is new."""
     homes = known.homes
-    everyone = homes.keys() | new_ids
-    total, located = len(everyone), len(known.located & everyone)
+    fresh = [k for k in new_ids if k not in homes]
+    total, located = len(homes) + len(fresh), homes.located + sum(k in known.located for k in fresh)
     grown = total < FEW or total >= GROWTH * known.solved_frames
     # Its first fixes place a map badly that was flown without GPS: twice as many place it better.
     if grown or (located > 0 and located >= GROWTH * known.solved_located):
         return True
-    maps = {k: home for k, home in homes.items() if home != k or k in known.waiting}
+    ends = {k for m in matches for k in (m.low, m.high) if k in homes}
+    maps = {k: homes[k] for k in ends if homes[k] != k or k in known.waiting}
     known.tied |= joins(maps, new_ids, matches) or lifts(known, new_ids, matches)
     return known.tied and total >= MERGE_GROWTH * known.solved_frames
 

@@ -26,6 +26,8 @@ _OVERHEAD_BYTES = 400
 def matches(mission_id: str, touching: Collection[str] | None) -> list[PairMatch]:
     """The accepted matches, of all pairs or of those of some frames, by (low, high)."""
     with db.read() as tx:
+        if touching is None:
+            return [PairMatch.from_bytes(m) for m in pairs.all_accepted(tx, mission_id)]
         return [PairMatch.from_bytes(m) for m in pairs.accepted(tx, mission_id, touching)]
 
 

@@ -30,7 +30,7 @@ def sighting(mission_id: str, frame: GraphFrame) -> Sighting:
 def look(mission_id: str, known: Known) -> list[PairKey]:
     """Pairs that may tie two maps, for some frames that have not looked yet; they are kept as `tries`."""
     homes = known.homes
-    if len(set(homes.values())) < 2:
+    if homes.maps < 2:
         known.untried.clear()
         return []
     seekers = sorted(known.untried)[:LOOKING]
@@ -40,7 +40,7 @@ def look(mission_id: str, known: Known) -> list[PairKey]:
     gallery = _gallery(mission_id)
     gallery.add(
         sighting(mission_id, known.seen[k])
-        for k in sorted((homes.keys() & known.seen.keys()) - gallery.row_of.keys())
+        for k in sorted(k for k in known.seen if k not in gallery.row_of and k in homes)
     )
     found = live_ties(seekers, gallery, homes, tried)
     known.tries |= set(found)

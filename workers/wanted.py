@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections import OrderedDict
 from collections.abc import Sequence
 
 from core.matching import PairMatch
-from core.neighbours import candidates
+from core.neighbours import Sighting, candidates
 from core.pose_graph import GraphFrame
 from core.ties import Canonical, canonical
 from services.catalog import frames, pairs
@@ -22,6 +23,9 @@ _asked: dict[tuple[str, Key], float] = {}
 _expected: dict[str, tuple[int, float]] = {}
 """How many pairs must be there before those that the final solve asked for can be; and how long it waits."""
 _ahead: dict[str, float] = {}
+_sightings: OrderedDict[str, dict[str, Sighting]] = OrderedDict()
+"""Of the missions that are being finished: each is looked at several times, and all of its frames at once."""
+_FINISHING = 2
 
 
 def missing(mission_id: str) -> bool:
@@ -43,7 +47,7 @@ def ahead(mission: Mission) -> list[Key]:
         seen = frames.sightings(tx, mission.id)
         done = set(pairs.keys(tx, mission.id))  # or somebody is at it
     graph = [GraphFrame(s.frame_id, s.name, s.meta) for s in seen]
-    wanted = candidates([sighting(mission.id, f) for f in graph])
+    wanted = candidates(_seen(mission.id, graph))
     return _to_ask(mission.id, sorted(set(wanted) - done))
 
 
@@ -62,15 +66,26 @@ def canonical_pairs(mission: Mission, graph: Sequence[GraphFrame]) -> tuple[Cano
         everyone = set(wanted)
         return None if left else [m for m in matches(mission.id, None) if (m.low, m.high) in everyone]
 
-    return canonical([sighting(mission.id, f) for f in graph], matched), ask
+    return canonical(_seen(mission.id, graph), matched), ask
 
 
 def forget(mission_id: str) -> None:
     """Nothing is waited for any more."""
     _expected.pop(mission_id, None)
     _ahead.pop(mission_id, None)
+    _sightings.pop(mission_id, None)
     for key in [key for key in _asked if key[0] == mission_id]:
         del _asked[key]
+
+
+def _seen(mission_id: str, graph: Sequence[GraphFrame]) -> list[Sighting]:
+    """The frames as the search for partners sees them, each read once."""
+    known = _sightings.pop(mission_id, {})
+    while len(_sightings) >= _FINISHING:
+        _sightings.popitem(last=False)
+    _sightings[mission_id] = known
+    known.update((f.frame_id, sighting(mission_id, f)) for f in graph if f.frame_id not in known)
+    return [known[f.frame_id] for f in graph]
 
 
 def _to_ask(mission_id: str, left: Sequence[Key]) -> list[Key]:

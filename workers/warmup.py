@@ -96,7 +96,7 @@ def solving() -> None:
     matches = [_match(k - step, k) for k in range(FRAMES) for step in (3, 1) if k >= step]
     last = frames[-1].frame_id
     solution = solve(frames[:-1], [m for m in matches if m.high != last])
-    place(solution, frames, [last], matches)
+    place(solution, {f.frame_id: f for f in frames}, [last], matches)
 
 
 def _match(i: int, j: int) -> PairMatch:

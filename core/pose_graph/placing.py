@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Collection, Sequence
+from collections import ChainMap
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -44,25 +45,28 @@ class Sight:
 
 def place(
     solution: Solution,
-    frames: Sequence[GraphFrame],
+    known: Mapping[str, GraphFrame],
     new_ids: Collection[str],
     matches: Sequence[PairMatch],
     params: PoseParams | None = None,
 ) -> Solution:
     """`solution` with the frames `new_ids` in it; every other pose stays as it is.
 
-    `frames`: at least the new ones and those they are matched with. A new frame that ties to nothing posed
-    lies where its GPS says. The result does not depend on the order of any argument.
+    `known`: by id, at least the new ones and those they are matched with. A new frame that ties to nothing
+    posed lies where its GPS says. The result does not depend on the order of any argument; what it costs does
+    not depend on how many frames are posed, as long as the new ones tie to some.
     """
     params = params or PoseParams()
-    known = {f.frame_id: f for f in frames}
     new = sorted({k for k in new_ids if k in known}, key=lambda k: capture_order(known[k]))
     ties: dict[str, list[PairMatch]] = {k: [] for k in new}
     for m in matches:
         for end in {m.low, m.high} & ties.keys():
             if m.accepted and m.low in known and m.high in known:
                 ties[end].append(m)
-    poses = {k: p for k, p in solution.poses.items() if k not in ties}
+    posed = solution.poses
+    if any(k in posed for k in ties):
+        posed = {k: p for k, p in posed.items() if k not in ties}
+    poses = ChainMap[str, Pose]({}, posed)  # type: ignore[arg-type]  # only the first map is written to
     near = _Surroundings(known, replace(solution, poses=poses))
     cameras = dict(solution.cameras)
     unplaced = {k: v for k, v in solution.unplaced.items() if k not in ties}
@@ -75,13 +79,12 @@ def place(
             unplaced[frame_id] = pose
         else:
             poses[frame_id] = pose
-    ordered = {k: poses[k] for k in sorted(poses)}
-    return replace(solution, cameras=cameras, poses=ordered, unplaced=unplaced)
+    return replace(solution, cameras=cameras, poses=poses, unplaced=unplaced)
 
 
 def _pose(
     solution: Solution,
-    known: dict[str, GraphFrame],
+    known: Mapping[str, GraphFrame],
     near: _Surroundings,
     frame_id: str,
     ties: list[PairMatch],
@@ -108,7 +111,7 @@ def _pose(
 
 
 def _survey(
-    known: dict[str, GraphFrame], frame_id: str, others: set[str], solution: Solution, params: PoseParams
+    known: Mapping[str, GraphFrame], frame_id: str, others: set[str], solution: Solution, params: PoseParams
 ) -> tuple[Survey, int]:
     """A frame among some others, and its row."""
     s = survey([known[k] for k in {frame_id, *others}], params, solution.world)
@@ -118,7 +121,7 @@ def _survey(
 class _Surroundings:
     """Who flew or lies near a frame that ties to nothing; made once it is asked, for all frames of a call."""
 
-    def __init__(self, known: dict[str, GraphFrame], solution: Solution) -> None:
+    def __init__(self, known: Mapping[str, GraphFrame], solution: Solution) -> None:
         self._known, self._solution = known, solution
 
     @cached_property
@@ -152,7 +155,7 @@ class _Surroundings:
         return out | {self._visual[int(k)] for k in np.atleast_1d(near)}
 
 
-def _beside(known: dict[str, GraphFrame], frame_id: str, partners: set[str]) -> set[str]:
+def _beside(known: Mapping[str, GraphFrame], frame_id: str, partners: set[str]) -> set[str]:
     """Of the frames it is matched with, the same drone's just before and after it: for speed and heading."""
     me = known[frame_id]
     same = sorted(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from sqlalchemy import ColumnElement, bindparam, func, or_, select, tuple_
+from sqlalchemy import ColumnElement, Integer, bindparam, func, or_, select, tuple_
 from sqlalchemy.orm import Session
 
 from services.catalog.rows import chunks, clock, mission, table
@@ -36,6 +36,21 @@ _FRAMES = (
     .where(_FRAME.mission_id == bindparam("mission"), _FRAME.state.in_(("received", "ready", "matched")))
     .group_by(_FRAME.state)
 )
+_MATCHED_AT = select(_FRAME.matched_at).where(
+    _FRAME.mission_id == bindparam("mission"), _FRAME.id == bindparam("frame")
+)
+_WAITING = (
+    select(_FRAME.id)
+    .where(_FRAME.mission_id == bindparam("mission"), _FRAME.state == "matched")
+    .where(_FRAME.id != bindparam("frame"), _FRAME.matched_at >= bindparam("since"))
+    .limit(1)
+)
+_UNREAD = select(func.count()).select_from(
+    select(_FRAME.id)
+    .where(_FRAME.mission_id == bindparam("mission"), _FRAME.state.in_(("received", "ready")))
+    .limit(bindparam("most", type_=Integer))
+    .subquery()
+)
 _CLAIMED = _DIRTY.claimed_at > bindparam("begun")
 _TILES = select(
     func.count().filter(_to_do(), _CLAIMED),
@@ -59,13 +74,13 @@ def is_news(tx: Session, mission_id: str, frame_id: str, calm_s: float, workers:
     Not for one of many: the first of every `calm_s` wakes it, the last that there is to match, and the one
     after which there are only as many as `workers` are at.
     """
-    at = tx.scalar(select(Frame.matched_at).where(Frame.mission_id == mission_id, Frame.id == frame_id))
-    since = (at or 0.0) // calm_s * calm_s
-    waiting = (Frame.state == "matched") & (Frame.id != frame_id) & (Frame.matched_at >= since)
-    unread = Frame.state.in_(("received", "ready"))
-    query = select(func.count().filter(waiting), func.count().filter(unread))
-    others, still_to_come = tx.execute(query.where(Frame.mission_id == mission_id)).one()
-    return not others or still_to_come in (0, workers)
+    this = {"mission": mission_id, "frame": frame_id}
+    at = tx.execute(_MATCHED_AT, this).scalar()
+    if tx.execute(_WAITING, this | {"since": (at or 0.0) // calm_s * calm_s}).first() is None:
+        return True
+    # Counted no further than it matters: thousands may still be to come.
+    still_to_come = tx.execute(_UNREAD, {"mission": mission_id, "most": workers + 1}).scalar_one()
+    return still_to_come in (0, workers)
 
 
 @dataclass(frozen=True, slots=True)

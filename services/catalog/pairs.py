@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from services.catalog.rows import chunks, hold, insert
 from services.tables import Pair
 
 Key = tuple[str, str]
+_AT_ONCE = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +140,7 @@ def keys_of(tx: Session, mission_id: str, frame_ids: Collection[str]) -> Sequenc
 def accepted(tx: Session, mission_id: str, touching: Collection[str] | None = None) -> Sequence[bytes]:
     """The matches of the accepted pairs, sorted by (low, high); `touching`: only those of these frames."""
     if touching is None:
-        return _accepted(tx, mission_id)
+        return [*all_accepted(tx, mission_id)]
     found: dict[Key, bytes] = {}
     for some in chunks(sorted(touching)):
         for mine in (Pair.low, Pair.high):  # by frame alone, as in `verdicts`
@@ -207,10 +208,12 @@ def summary(tx: Session, mission_id: str) -> PairSummary:
     return PairSummary(total, done, good, dict(sorted(reasons.items())))
 
 
-def _accepted(tx: Session, mission_id: str) -> Sequence[bytes]:
+def all_accepted(tx: Session, mission_id: str) -> Iterator[bytes]:
+    """The matches of all accepted pairs, sorted by (low, high), one after the other: they are many."""
     query = (
         select(Pair.matches)
         .where(Pair.mission_id == mission_id, Pair.state == "done", Pair.accepted.is_(True))
         .order_by(Pair.low, Pair.high)
     )
-    return [matches for matches in tx.scalars(query) if matches is not None]
+    rows = tx.scalars(query.execution_options(yield_per=_AT_ONCE))
+    return (matches for matches in rows if matches is not None)

@@ -150,7 +150,7 @@ def live(flight: Flown, first: int, bad: Collection[int]) -> Solution:
     for k in range(first, len(ids)):
         known = set(ids[: k + 1])
         ties = [m for m in told.matches if ids[k] in (m.low, m.high) and {m.low, m.high} <= known]
-        solution = place(solution, told.frames[: k + 1], [ids[k]], ties)
+        solution = place(solution, {f.frame_id: f for f in told.frames[: k + 1]}, [ids[k]], ties)
     return solution
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 
-from core.neighbours import NeighbourParams
+from core.neighbours import NeighbourParams, Sighting
+from core.pose_graph import GraphFrame
+from core.ties import Canonical, Matched
 from services.catalog import backlog, pairs
 
 
@@ -38,3 +41,31 @@ def test_workers_find_the_final_pairs_waiting_when_the_last_photos_are_read(
     assert early
     assert bench.state == "final"
     assert bench.tiles() == expected
+
+
+def test_while_a_mission_is_finished_each_frame_is_read_once(
+    bench: Any, photos: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = bench.modules["sequence"].wanted
+    read, asked = list[str](), list[int]()
+    sighting, canonical = wanted.sighting, wanted.canonical
+
+    def reading(mission_id: str, frame: GraphFrame) -> Sighting:
+        read.append(frame.frame_id)
+        return sighting(mission_id, frame)
+
+    def asking(frames: Sequence[Sighting], matched: Matched) -> Canonical | None:
+        asked.append(len(frames))
+        return canonical(frames, matched)
+
+    few = NeighbourParams(nearest=1, sectors=1, before_and_after=1, alike=0)
+    monkeypatch.setattr(bench.modules["match"], "LIVE", few)
+    monkeypatch.setattr(wanted, "sighting", reading)
+    monkeypatch.setattr(wanted, "canonical", asking)
+    bench.upload(photos)
+    bench.finalise()
+    bench.drain()
+    assert bench.state == "final"
+    assert len(asked) > 1
+    assert len(read) == len(set(read)) == len(photos)
+    assert bench.mission_id not in wanted._sightings
