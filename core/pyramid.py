@@ -1,14 +1,13 @@
 """The pyramid of tiles: every overview is the reduction of its four children; and a tile's bytes.
 
 Tiles are RGBA (512, 512, 4) uint8, alpha not premultiplied. Opaque tiles become JPEG, tiles with alpha WebP,
-or all of them PNG; fully transparent ones are not stored at all. Equal pixels give equal bytes.
+fully transparent ones are not stored at all. Equal pixels give equal bytes.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -21,16 +20,13 @@ from PIL import WebPImagePlugin as WebPImagePlugin
 
 from core.compiled import compiled
 from core.grid import TILE_PX
+from core.webp import decode_apart
 
 Rgba = NDArray[np.uint8]
 
 JPEG = "image/jpeg"
 WEBP = "image/webp"
-PNG = "image/png"
 QUALITY = 80
-
-TileFormat = Literal["jpeg", "png"]
-"""`jpeg`: small: JPEG, where something is transparent WebP. `png`: without loss, several times as large."""
 
 
 def reduce(children: Sequence[Rgba | None]) -> Rgba:
@@ -77,31 +73,20 @@ def _halve(rgba: Rgba, out: Rgba) -> None:
                 out[y, x, k] = (2 * (upper + lower) + total) // (2 * total) if total else 0
 
 
-def encode(rgba: Rgba, tile_format: TileFormat = "jpeg") -> tuple[bytes, str] | None:
-    """A tile's bytes and media type, None when nothing of it is known."""
+def encode(rgba: Rgba, quality: int = QUALITY) -> tuple[bytes, str] | None:
+    """A tile's bytes and media type: JPEG when opaque, WebP when not, None when nothing of it is known."""
     pixels = np.ascontiguousarray(rgba)
     if not _alpha(np.bitwise_or, pixels):
         return None
-    opaque = _alpha(np.bitwise_and, pixels) == 255
-    if tile_format == "png":
-        return _png(pixels, opaque), PNG
-    if opaque:
+    if _alpha(np.bitwise_and, pixels) == 255:
         return simplejpeg.encode_jpeg(
-            pixels, quality=QUALITY, colorspace="RGBX", colorsubsampling="420"
+            pixels, quality=quality, colorspace="RGBX", colorsubsampling="420"
         ), JPEG
     out = io.BytesIO()
     # method 1: a third of the bytes less than method 0, which hardly packs the alpha, and three times as fast
     # as the default for a twentieth more.
-    Image.fromarray(pixels, "RGBA").save(out, "WEBP", quality=QUALITY, method=1)
+    Image.fromarray(pixels, "RGBA").save(out, "WEBP", quality=quality, method=1)
     return out.getvalue(), WEBP
-
-
-def _png(pixels: Rgba, opaque: bool) -> bytes:
-    order = cv2.COLOR_RGBA2BGR if opaque else cv2.COLOR_RGBA2BGRA
-    # level 1: twice as fast as the default for a twentieth more bytes
-    done, data = cv2.imencode(".png", cv2.cvtColor(pixels, order), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    assert done
-    return data.tobytes()
 
 
 def decode(data: bytes) -> Rgba:
@@ -109,7 +94,9 @@ def decode(data: bytes) -> Rgba:
     if data[:2] == b"\xff\xd8":
         rgba = simplejpeg.decode_jpeg(data, colorspace="RGBA")
         return np.asarray(rgba, np.uint8)
-    # Pillow composes it as the frame of a film, which takes a quarter longer.
+    apart = decode_apart(data)
+    if apart is not None:
+        return apart
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError("These bytes are no tile's picture.")
