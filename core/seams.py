@@ -51,33 +51,35 @@ def settle(weights: Int32, spots: Int16) -> Int32:
 def _claim(weights: Int32, spots: Int16, cost: Costs, step: Costs) -> None:
     """Each photo's claim on each knot, −1 (its own) … 1 (nothing to seek there), and how dear a step is."""
     n, rows, cols = weights.shape
-    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    first, second = np.empty(cols, np.int32), np.empty(cols, np.int32)
+    low, high = np.empty((cols, 3), np.int32), np.empty((cols, 3), np.int32)
     for y in range(rows):
-        for x in range(cols):
-            first, second, best = 0, 0, -1
-            for k in range(n):
-                w = weights[k, y, x]
-                if w > first:
-                    first, second, best = w, first, k
-                elif w > second:
-                    second = w
-            if first < INSIDE:
-                continue
-            low[:], high[:] = 1 << 20, -(1 << 20)
-            for k in range(n):
+        first[:], second[:], low[:], high[:] = 0, 0, 1 << 20, -(1 << 20)
+        for k in range(n):
+            line = weights[k, y]
+            for x in range(cols):
+                second[x] = max(second[x], min(first[x], line[x]))
+                first[x] = max(first[x], line[x])
+        for k in range(n):
+            for x in range(cols):
                 w = weights[k, y, x]
                 if w < INSIDE:
                     continue
-                m = second if k == best else first
+                m = second[x] if w == first[x] else first[x]
                 claim = np.float32((m - w) / (m + w))
                 if claim <= CONTEST:
                     cost[k, y, x] = claim
                     for c in range(3):
-                        low[c] = min(low[c], spots[k, y, x, c])
-                        high[c] = max(high[c], spots[k, y, x, c])
-            apart = max((high - low).max(), 0) / (16 * ALIKE)
-            alike = 1 / (1 + apart * apart * apart * apart)
-            step[y, x] = LEAST_STEP + STEP * alike
+                        low[x, c] = min(low[x, c], spots[k, y, x, c])
+                        high[x, c] = max(high[x, c], spots[k, y, x, c])
+        for x in range(cols):
+            if first[x] >= INSIDE:
+                widest = 0
+                for c in range(3):
+                    widest = max(widest, high[x, c] - low[x, c])
+                apart = widest / (16 * ALIKE)
+                alike = 1 / (1 + apart * apart * apart * apart)
+                step[y, x] = LEAST_STEP + STEP * alike
 
 
 @compiled
@@ -86,30 +88,32 @@ def _spread(cost: Costs, step: Costs) -> None:
 
     To the four nearest and to all eight around by turns: so fronts are octagons, and seams no squares.
     """
+    height, width = step.shape
     for k in range(len(cost)):
         top, bottom, left, right = _contested(cost[k])
         rows, cols = bottom - top, right - left
         if rows <= 0:
             continue
-        held, across = np.full((rows + 2, cols), _FAR), np.full((rows + 2, cols), _FAR)
-        own = cost[k, top:bottom, left:right].copy()
-        dear = step[top:bottom, left:right].copy()
+        old, dear = np.full((rows + 2, cols + 2), _FAR), np.empty((rows, cols), np.float32)
         for y in range(rows):
             for x in range(cols):
-                dear[y, x] += _FAR if own[y, x] >= _FAR else np.float32(0)
+                old[y + 1, x + 1] = own = cost[k, top + y, left + x]
+                dear[y, x] = step[top + y, left + x] + (_FAR if own >= _FAR else np.float32(0))
+        new = old.copy()
         for turn in range(REACH_CELLS):
-            for y in range(rows):
-                line, still, wide = own[y], held[y + 1], across[y + 1]
-                still[:] = line
-                wide[0], wide[cols - 1] = min(line[0], line[1]), min(line[cols - 2], line[cols - 1])
-                for x in range(1, cols - 1):
-                    wide[x] = min(min(line[x - 1], line[x]), line[x + 1])
-            beside = across if turn % 2 else held
-            for y in range(rows):
-                line, price, above, level, below = own[y], dear[y], beside[y], across[y + 1], beside[y + 2]
-                for x in range(cols):
-                    line[x] = min(line[x], min(min(above[x], level[x]), below[x]) + price[x])
-        cost[k, top:bottom, left:right] = own
+            # What is not settled now is too near the border to change what will be.
+            first, last = max(turn + 1 - top, 0), min(height - 1 - turn - top, rows)
+            start, stop = max(turn + 1 - left, 0), min(width - 1 - turn - left, cols)
+            for y in range(first, last):
+                above, here, below = old[y, start:], old[y + 1, start:], old[y + 2, start:]
+                out, price = new[y + 1, start + 1 :], dear[y, start:]
+                for x in range(stop - start):
+                    near = min(min(above[x + 1], below[x + 1]), min(here[x], here[x + 2]))
+                    if turn % 2:
+                        near = min(near, min(min(above[x], above[x + 2]), min(below[x], below[x + 2])))
+                    out[x] = min(here[x + 1], near + price[x])
+            old, new = new, old
+        cost[k, top:bottom, left:right] = old[1:-1, 1:-1]
 
 
 @compiled

@@ -55,16 +55,21 @@ def give_way(weights: Int32, sharp: Bytes) -> None:
     `sharp`: the `sharpness` of each photo at the same knots.
     """
     n, rows, cols = weights.shape
+    top, best = np.empty(cols, np.int32), np.empty(cols, np.int32)
     for y in range(rows):
-        for x in range(cols):
-            top, best = 0, 0
-            for k in range(n):
-                top = max(top, weights[k, y, x])
-            for k in range(n):
-                w = weights[k, y, x]
-                if w >= INSIDE and WELL * w >= top:
-                    best = max(best, sharp[k, y, x])
-            for k in range(n):
-                w, s = weights[k, y, x], sharp[k, y, x] / (CLEARLY * max(best, 1))
+        top[:], best[:] = 0, 1
+        for k in range(n):
+            line = weights[k, y]
+            for x in range(cols):
+                top[x] = max(top[x], line[x])
+        for k in range(n):
+            line, told = weights[k, y], sharp[k, y]
+            for x in range(cols):
+                if line[x] >= INSIDE and WELL * line[x] >= top[x]:
+                    best[x] = max(best[x], told[x])
+        for k in range(n):
+            line, told = weights[k, y], sharp[k, y]
+            for x in range(cols):
+                w, s = line[x], told[x] / (CLEARLY * best[x])
                 if w >= INSIDE and 0 < s < 1:
-                    weights[k, y, x] = INSIDE + np.int32((w - INSIDE) * s * s * s * s)
+                    line[x] = INSIDE + np.int32((w - INSIDE) * s * s * s * s)
