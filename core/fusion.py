@@ -182,7 +182,7 @@ def render(
     lattice = wide.inner(params.rim_cells)
     drawn = _draw(scene, lattice, grid.resolution_m(world), photos, params)
     top, left = grid.row0 - lattice.row0, grid.col0 - lattice.col0
-    return drawn[top : top + grid.height, left : left + grid.width].copy()
+    return drawn[top : top + grid.height, left : left + grid.width]
 
 
 def _kept(only: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
@@ -214,9 +214,7 @@ class _Scene:
     ) -> _Scene | None:
         """The winners among frames by ascending id (ties go to the lower); None when nobody sees it."""
         rim = params.rim_cells
-        views = Views.empty(len(frames), lattice, rim)
-        for k, frame in enumerate(frames):
-            _look(views, k, lattice, resolution_m, frame, photos, params)
+        frames, views = _seen(lattice, resolution_m, frames, photos, params)
         give_way(views.weight, views.sharp)
         inner = np.s_[:, rim : lattice.rows - rim, rim : lattice.cols - rim]
         given = np.ascontiguousarray(views.weight[inner])
@@ -247,20 +245,23 @@ def _importance(frame: PosedFrame, resolution_m: float, params: FusionParams) ->
     return importance
 
 
-def _look(
-    views: Views,
-    k: int,
+def _seen(
     lattice: Lattice,
     resolution_m: float,
-    frame: PosedFrame,
+    frames: Sequence[PosedFrame],
     photos: Photos,
     params: FusionParams,
-) -> None:
-    gsd_m = abs(frame.pose.gsd_m(frame.camera))
-    importance = _importance(frame, resolution_m, params)
-    skirt_px = SKIRT_CELLS * params.cell_px * resolution_m / gsd_m
-    tones = _toned(frame, photos.thumb(frame.frame_id), params.tone_side_px)
-    look(lattice, frame, tones, importance, params.min_cos_view, skirt_px, views, k)
+) -> tuple[list[PosedFrame], Views]:
+    """The frames that see any of the lattice, in their order, and what they see."""
+    views, seen = Views.empty(len(frames), lattice, params.rim_cells), list[PosedFrame]()
+    for frame in frames:
+        gsd_m = abs(frame.pose.gsd_m(frame.camera))
+        importance = _importance(frame, resolution_m, params)
+        skirt_px = SKIRT_CELLS * params.cell_px * resolution_m / gsd_m
+        tones = _toned(frame, photos.thumb(frame.frame_id), params.tone_side_px)
+        if look(lattice, frame, tones, importance, params.min_cos_view, skirt_px, views, len(seen)):
+            seen.append(frame)
+    return seen, views.first(len(seen))
 
 
 _toned_last: dict[tuple[str, Gain, int], tuple[Rgb, tuple[Rgb, Rgb, Rgb]]] = {}

@@ -99,9 +99,16 @@ class Views(NamedTuple):
         return cls(
             np.zeros(wide, np.int32),
             np.zeros(wide, np.uint8),
-            np.zeros((*wide, 3), np.int16),
-            *(np.zeros((*inner, 3), np.int16) for _ in range(3)),
+            # Where a frame has no say, nobody asks what it sees.
+            np.empty((*wide, 3), np.int16),
+            *(np.empty((*inner, 3), np.int16) for _ in range(3)),
         )
+
+    def first(self, frames: int) -> Views:
+        """What the first so many frames see."""
+        weight, sharp, spot, own, even, detail = self
+        part = np.s_[:frames]
+        return Views(weight[part], sharp[part], spot[part], own[part], even[part], detail[part])
 
 
 @lru_cache(maxsize=256)
@@ -132,15 +139,15 @@ def look(
     skirt_px: float,
     views: Views,
     k: int,
-) -> None:
-    """Weights and tones of one frame at all knots, into the k-th of `views`.
+) -> bool:
+    """Weights and tones of one frame at all knots, into the k-th of `views`; whether it has a say at any.
 
     `tones`: the photo shrunk, (h, w, 3) uint8 or with its sharpness (h, w, 4), to a few pixels, and to fewer
     still. `importance`: 0 … 1, multiplies the weight. `skirt_px`: how far beyond the photo's edge weights
     fade out, in its own pixels.
     """
     pose = frame.pose
-    _look(
+    return _look(
         lattice.columns.foot,
         lattice.columns.slope,
         np.ascontiguousarray(pose.world_R_cam, np.float64),
@@ -207,11 +214,12 @@ def warp(
             continue
         left, right = int(wanted[0]), int(wanted[-1]) + 1
         shape = ((bottom - top) * cell_px, (right - left) * cell_px)
-        xy, fraction = np.empty((*shape, 2), np.int16), np.empty(shape, np.uint16)
+        xy, fraction = np.empty(shape, "<i4"), np.empty(shape, np.uint16)
         around = np.ascontiguousarray(lattice_knots[top : bottom + 2, left : right + 2])
         _fine_maps(around, cell_px, xy, fraction)
         view = out[top * cell_px : bottom * cell_px, left * cell_px : right * cell_px]
-        seen = cv2.remap(photo, xy, fraction, method, borderMode=cv2.BORDER_REFLECT)
+        places = xy.view(np.int16).reshape(*shape, 2)
+        seen = cv2.remap(photo, places, fraction, method, borderMode=cv2.BORDER_REFLECT)
         show(np.asarray(seen, np.uint8), curves(gain), view)
     return out
 
@@ -312,11 +320,12 @@ def _look(
     own: Int16,
     light: Int16,
     detail: Int16,
-) -> None:
+) -> bool:
     importance, min_cos_view, skirt_px, reach_m = limits
     width, height = lens[6], lens[7]
     bare = not falloff.any()
     cols, rim = weight.shape[1], (weight.shape[1] - own.shape[1]) // 2
+    seen = False
     least, value, around = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
     for k in range(foot.shape[0]):
         x, y = foot[k, 0] + slope[k, 0] * h_m, foot[k, 1] + slope[k, 1] * h_m
@@ -329,7 +338,7 @@ def _look(
         if w < 0:
             continue
         j, i = k // cols, k % cols
-        weight[j, i] = w
+        weight[j, i], seen = w, True
         right, down = (u + 0.5) / width, (v + 0.5) / height
         if thumb.shape[2] > 3 and w >= INSIDE:
             sharp[j, i] = thumb[int(down * thumb.shape[0]), int(right * thumb.shape[1]), 3]
@@ -351,13 +360,13 @@ def _look(
                 dim = rho2 * (falloff[3 * c] + rho2 * (falloff[3 * c + 1] + rho2 * falloff[3 * c + 2]))
                 dim += falloff[9 + 2 * c] * east + falloff[10 + 2 * c] * north
                 light[j, i, c] = math.floor(16 * lit(value[c] / 16, math.exp(-dim)) + 0.5)
+    return seen
 
 
 @compiled
-def _fine_maps(
-    lattice_knots: Int32, cell_px: int, xy: NDArray[np.int16], fraction: NDArray[np.uint16]
-) -> None:
-    """Bilinear between knots; the last 5 bits go to `fraction` as cv2.remap wants them.
+def _fine_maps(lattice_knots: Int32, cell_px: int, xy: Int32, fraction: NDArray[np.uint16]) -> None:
+    """Bilinear between knots, as cv2.remap wants it: x in a word's lower half, y in its upper, and the
+    5 bits behind the point of both in `fraction`.
 
     In float64, where every product and sum of these small integers is exact and vectors are fast.
     """
@@ -381,6 +390,5 @@ def _fine_maps(
         along, down = line[0, half : half + xy.shape[1]], line[1, half : half + xy.shape[1]]
         places, parts = xy[y], fraction[y]
         for x in range(len(along)):
-            places[x, 0] = along[x] >> 5
-            places[x, 1] = down[x] >> 5
+            places[x] = ((down[x] >> 5) << 16) | ((along[x] >> 5) & 0xFFFF)
             parts[x] = ((down[x] & 31) << 5) | (along[x] & 31)
