@@ -326,6 +326,20 @@ def test_finalising_and_downloads(page: Page, service: Service, mission: Mission
     with page.expect_download() as download, service.db.write() as tx:
         exports.finish(tx, mission.mission_id, "mosaic.tif", 1, key, 10, "image/tiff")
     assert Path(download.value.path()).read_bytes() == b"the mosaic"
+    row = page.get_by_role("button", name="Orthophoto").locator(".size")
+    expect(row).to_have_text("10 B")
+    mission.fly(shots[4:8])
+    expect(row).to_have_text("")  # a click brings another file by now
+    route = page.get_by_role("button", name="Flight route")
+    for reason in ("There is no room for it.", "There still is none."):
+        route.click()
+        expect(route).to_contain_text("being made…")
+        with service.db.write() as tx:
+            wanted = exports.get(tx, mission.mission_id, "route.csv")
+            assert wanted is not None
+            assert exports.fail(tx, mission.mission_id, "route.csv", wanted.revision, reason)
+        expect(route.locator(".why")).to_have_text(reason)
+        expect(route).to_be_enabled()
     page.get_by_role("button", name="Finalise map").click()
     expect(page.locator(".pill")).to_have_text("Finalising")
     expect(page.get_by_role("button", name="Finalise map")).to_be_disabled()

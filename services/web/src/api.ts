@@ -83,6 +83,7 @@ export interface ExportDoc {
   name: string;
   state: "available" | "wanted" | "ready" | "failed";
   size_bytes: number | null;
+  revision: number | null;
   error: string | null;
   url: string;
 }

@@ -82,7 +82,9 @@ export class MissionPage {
   private live: Live | null = null;
   private gone = false;
   private placed = false;
-  private readonly downloading = new Set<string>();
+  // Being asked for, and what the server has begun to make then.
+  private readonly asking = new Set<string>();
+  private readonly awaited = new Set<string>();
   private mission: Mission;
   private readonly refreshFrames = throttled(() => this.loadFrames());
   private readonly refreshRejected = throttled(() => this.loadRejected());
@@ -220,25 +222,24 @@ export class MissionPage {
   private async loadExports(): Promise<void> {
     const { exports } = await api.exports(this.mission.id);
     if (this.gone) return;
-    const asked = exports.filter((doc) => doc.state === "wanted").map((doc) => doc.name);
-    this.panel.setExports(exports, new Set([...asked, ...this.downloading]), this.mission.progress.revision > 0);
     // What somebody clicked on here and is made by now goes on by itself.
     for (const doc of exports) {
-      if (doc.state === "ready" && this.downloading.delete(doc.name)) void this.download(doc);
-      if (doc.state === "failed" && this.downloading.delete(doc.name)) this.say(doc.error ?? "This file could not be made.");
+      if (doc.state === "ready" && this.awaited.delete(doc.name)) void this.download(doc);
+      if (doc.state === "failed" && this.awaited.delete(doc.name)) this.say(doc.error ?? "This file could not be made.");
     }
+    const made = exports.filter((doc) => doc.state === "wanted").map((doc) => doc.name);
+    this.panel.setExports(exports, new Set([...made, ...this.asking, ...this.awaited]));
   }
 
   private async download(doc: ExportDoc): Promise<void> {
+    this.asking.add(doc.name);
     try {
-      this.downloading.add(doc.name);
-      if ((await api.wantExport(doc)) === "wanted") return this.refreshExports();
-      this.downloading.delete(doc.name);
-      h("a", { href: doc.url, download: doc.name }).click();
+      if ((await api.wantExport(doc)) === "wanted") this.awaited.add(doc.name);
+      else h("a", { href: doc.url, download: doc.name }).click();
     } catch (error) {
-      this.downloading.delete(doc.name);
       this.say(error instanceof Problem ? (doc.error ?? error.message) : OFFLINE);
     }
+    this.asking.delete(doc.name);
     this.refreshExports();
   }
 

@@ -15,9 +15,9 @@ const STATE: Record<MissionState, [label: string, tone: string]> = {
 };
 
 const EXPORT_TITLES: Record<string, [title: string, hint: string]> = {
-  "mosaic.tif": ["Orthophoto", "Cloud-optimised GeoTIFF"],
+  "mosaic.tif": ["Orthophoto", "GeoTIFF (COG)"],
   "preview.png": ["Preview", "PNG, 2048 px"],
-  "preview.zip": ["Preview, georeferenced", "PNG with world file"],
+  "preview.zip": ["Preview", "PNG with world file"],
   "tiles.pmtiles": ["Map tiles", "PMTiles"],
   "tiles.mbtiles": ["Map tiles", "MBTiles"],
   "tiles.zip": ["Map tiles", "XYZ folder, zip"],
@@ -53,10 +53,13 @@ export function reached(counts: Counts): { matched: number; posed: number; fused
   return { matched: counts.matched + counts.waiting + posed, posed, fused };
 }
 
-function exportNote(doc: ExportDoc, wanted: boolean): string {
+const FAILED = "failed";
+
+/** How large a file is can be told while it is the one that a click brings: a map that grew since has another. */
+function exportNote(doc: ExportDoc, wanted: boolean, revision: number): string {
   if (wanted) return "being made…";
-  if (doc.state === "failed") return doc.error ?? "failed";
-  return doc.state === "ready" && doc.size_bytes !== null ? bytes(doc.size_bytes) : "";
+  if (doc.state === "failed") return FAILED;
+  return doc.state === "ready" && doc.revision === revision && doc.size_bytes !== null ? bytes(doc.size_bytes) : "";
 }
 
 function stat(label: string, hint: string): { root: HTMLElement; value: HTMLElement } {
@@ -100,6 +103,8 @@ export class Panel {
   private readonly finalise: HTMLButtonElement;
   private readonly finaliseHint = h("p", { class: "note" });
   private lastLegend = "";
+  private exports: ExportDoc[] = [];
+  private wanted: ReadonlySet<string> = new Set();
   private lastExports = "";
 
   constructor(private readonly actions: PanelActions) {
@@ -189,6 +194,7 @@ export class Panel {
     this.setBar(progress);
     this.setFigures(progress);
     this.setFinalise(progress, good);
+    this.listExports();
   }
 
   private setBar({ counts, total }: Progress): void {
@@ -231,20 +237,29 @@ export class Panel {
     fill(this.rejectedList, ...frames.map((f) => h("li", {}, h("strong", {}, f.name), h("span", {}, f.reason ?? f.code ?? ""))));
   }
 
-  setExports(exports: ExportDoc[], wanted: ReadonlySet<string>, onMap: boolean): void {
-    // A list that is drawn again under the pointer loses the click.
-    const now = JSON.stringify([exports, [...wanted], onMap]);
-    if (now === this.lastExports) return;
-    this.lastExports = now;
-    if (!onMap) fill(this.downloads, h("li", { class: "note" }, "As soon as there is something on the map."));
-    else fill(this.downloads, ...exports.map((doc) => this.download(doc, wanted.has(doc.name))));
+  setExports(exports: ExportDoc[], wanted: ReadonlySet<string>): void {
+    this.exports = exports;
+    this.wanted = wanted;
+    this.listExports();
   }
 
-  private download(doc: ExportDoc, wanted: boolean): HTMLElement {
+  private listExports(): void {
+    const revision = this.mission?.progress.revision ?? 0;
+    const notes = this.exports.map((doc) => exportNote(doc, this.wanted.has(doc.name), revision));
+    // A list that is drawn again under the pointer loses the click.
+    const now = JSON.stringify([this.exports.map((doc) => [doc.name, doc.state, doc.error]), notes, revision > 0]);
+    if (now === this.lastExports) return;
+    this.lastExports = now;
+    if (!revision) fill(this.downloads, h("li", { class: "note" }, "As soon as there is something on the map."));
+    else fill(this.downloads, ...this.exports.map((doc, i) => this.download(doc, notes[i] ?? "")));
+  }
+
+  private download(doc: ExportDoc, note: string): HTMLElement {
     const [title, hint] = EXPORT_TITLES[doc.name] ?? [doc.name, ""];
     return h("li", {},
-      h("button", { class: "download", disabled: wanted, onclick: () => this.actions.download(doc) },
-        h("span", { class: "name" }, title, h("small", {}, hint)), h("span", { class: "size" }, exportNote(doc, wanted)), icon(ICONS.download)));
+      h("button", { class: "download", disabled: this.wanted.has(doc.name), onclick: () => this.actions.download(doc) },
+        h("span", { class: "name" }, title, h("small", {}, hint)), h("span", { class: "size" }, note), icon(ICONS.download),
+        note === FAILED && h("span", { class: "why" }, doc.error ?? "")));
   }
 
   /** Which colour is which drone, and which way of posing where photos were not all posed the same way. */
