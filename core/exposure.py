@@ -10,82 +10,27 @@ that the map as a whole gets neither brighter nor darker.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from core.compiled import compiled
 from core.geometry import Array, PosedFrame, World
+from core.lighting import DEFAULT, Dense, ExposureParams, Index, Sightings, Sparse, reweighted
 from core.tone import Gain, log_light
 from core.warp import intrinsics, project
 
 Thumb = NDArray[np.uint8]
-Index = NDArray[np.int64]
-Design = Any
-"""A matrix (M, unknowns), dense or sparse."""
-
-
-@dataclass(frozen=True, slots=True)
-class ExposureParams:
-    """How exposure is balanced.
-
-    `side_px`: photos are shrunk to this before their colours are compared; `points_per_side`: ground points
-    across a median footprint. `darkest`, `brightest`: grey levels between which a colour is trusted. In
-    logarithms: `noise` of one comparison; `outlier` beyond which it fades in the end, `doubt` at first, when
-    nobody's gain is known; the `gain_sigma` around 1 and the `falloff_sigma` around a perfect lens and
-    ground that looks the same from all sides.
-    """
-
-    side_px: int = 32
-    points_per_side: int = 16
-    darkest: float = 6.0
-    brightest: float = 248.0
-    noise: float = 0.25
-    outlier: float = 0.3
-    doubt: float = 1.0
-    gain_sigma: float = 0.3
-    falloff_sigma: float = 0.3
-    iterations: int = 6
-
-
-DEFAULT = ExposureParams()
-
-
-@dataclass(frozen=True, slots=True)
-class _Sightings:
-    """Who saw which point in what light. `frame`, `point`: (M,) int64, points ascending; `log`: (M, 3);
-    `place`: (M, 3), ρ² of `Camera.falloff` and how far east and north the unit ray goes; `start`: where the
-    sightings of each point begin, (P,).
-    """
-
-    frame: Index
-    point: Index
-    log: Array
-    place: Array
-    start: Index
-
-    @property
-    def terms(self) -> Array:
-        """What a channel's numbers in a camera's falloff are multiplied with, (M, 5)."""
-        rho2 = self.place[:, 0]
-        return np.column_stack((rho2, rho2**2, rho2**3, self.place[:, 1:]))
-
-    def sums(self, values: Array) -> Array:
-        """The sums of (M, …) values over each point's sightings, (P, …)."""
-        return np.asarray(np.add.reduceat(values, self.start, axis=0))
-
+_Part = tuple[Index, Index, Array, Array]
+"""Of one frame's sightings: frame, cell, log, place."""
 
 FLAT_RAY = 0.5
 """How far a ray near a photo's corner goes sideways a unit of its length."""
 FEW = 16
 """Up to so many unknown gains are solved for densely, without sparse matrices' overhead."""
-Solver = Callable[[Design, _Sightings, Array, Array], Array]
 
 
 def balance(
@@ -157,7 +102,7 @@ def light_apart(one: PosedFrame, other: PosedFrame) -> float:
 
 def _sightings(
     frames: Sequence[PosedFrame], thumbs: Mapping[str, Thumb], params: ExposureParams
-) -> _Sightings:
+) -> Sightings:
     """Every frame's colours at the points of one world-wide square lattice that its footprint holds."""
     outlines = [f.pose.footprint(f.camera) for f in frames]
     size = [float(np.sqrt(np.prod(o.max(0) - o.min(0)))) for o in outlines]
@@ -168,18 +113,33 @@ def _sightings(
     ]
     if not parts:
         nobody = np.zeros(0, np.int64)
-        return _Sightings(nobody, nobody, np.zeros((0, 3)), np.zeros((0, 3)), nobody)
-    frame, cells, log, place = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return Sightings(nobody, nobody, np.zeros((0, 3)), np.zeros((0, 3)), nobody)
+    cells = np.concatenate([part[1] for part in parts])
     _, point, count = np.unique(cells, return_inverse=True, return_counts=True)
     order = np.argsort(point, kind="stable")
     order = order[count[point[order]] > 1]
     first = np.diff(point[order], prepend=-1) > 0
-    return _Sightings(frame[order], np.cumsum(first) - 1, log[order], place[order], np.flatnonzero(first))
+    frame, log, place = _in_order(parts, order)
+    return Sightings(frame, np.cumsum(first) - 1, log, place, np.flatnonzero(first))
+
+
+def _in_order(parts: list[_Part], order: Index) -> tuple[Index, Array, Array]:
+    """Frame, log and place of the sightings in this order; each part goes as soon as it was copied."""
+    rank = np.full(sum(len(part[0]) for part in parts), -1)
+    rank[order] = np.arange(len(order))
+    frame, log, place = np.empty(len(order), np.int64), np.empty((len(order), 3)), np.empty((len(order), 3))
+    end = len(rank)
+    while parts:
+        frames, _, logs, places = parts.pop()
+        to = rank[end - len(frames) : end]
+        end, kept = end - len(frames), to >= 0
+        frame[to[kept]], log[to[kept]], place[to[kept]] = frames[kept], logs[kept], places[kept]
+    return frame, log, place
 
 
 def _sighting(
     k: int, frame: PosedFrame, outline: Array, thumb: Thumb, step: float, params: ExposureParams
-) -> tuple[Index, Index, Array, Array]:
+) -> _Part:
     camera, pose = frame.camera, frame.pose
     # A flat ray reaches for the horizon: so far away nothing is compared.
     reach = 3 * (abs(pose.center[2] - pose.ground_h_m) + step)
@@ -247,18 +207,13 @@ def _sight(
     return count
 
 
-def _solve(seen: _Sightings, lens: Index, lenses: int, params: ExposureParams) -> tuple[Array, Array]:
+def _solve(seen: Sightings, lens: Index, lenses: int, params: ExposureParams) -> tuple[Array, Array]:
     """Gains (N, 3) and falloffs (C, 15): log light = point − log gain + falloff."""
-    n, m = len(lens), len(seen.frame)
-    terms = seen.terms
+    n, terms = len(lens), seen.terms
     wide = terms.shape[1]
-    cols = np.column_stack((seen.frame, n + wide * lens[seen.frame][:, None] + np.arange(wide)))
-    values = np.column_stack((-np.ones(m), terms))
-    rows = np.repeat(np.arange(m), 1 + wide)
-    design = sparse.csr_matrix((values.ravel(), (rows, cols.ravel())), shape=(m, n + wide * lenses))
     prior = np.full(n + wide * lenses, params.falloff_sigma**-2)
     prior[:n] = params.gain_sigma**-2
-    answer = _reweighted(design, seen, prior, params, _sparsely)
+    answer = reweighted(Sparse(seen.frame, n, lens[seen.frame], lenses, terms), seen, prior, params)
     by_channel = answer[n:].reshape(lenses, wide, 3).transpose(0, 2, 1)
     falloff = [np.concatenate((of[:, :3].ravel(), of[:, 3:].ravel())) for of in by_channel]
     # Rounded, so that a sum's last bits never show in a tile.
@@ -272,55 +227,14 @@ def _by_channel(falloff: tuple[float, ...]) -> Array:
 
 
 def _fit(
-    seen: _Sightings, frames: Sequence[PosedFrame], free: NDArray[np.bool_], params: ExposureParams
+    seen: Sightings, frames: Sequence[PosedFrame], free: NDArray[np.bool_], params: ExposureParams
 ) -> Array:
     """The gains (n, 3) of the n free ones among the frames."""
     lenses = np.array([_by_channel(f.camera.falloff) for f in frames])
     gains = np.array([(1.0, 1.0, 1.0) if new else f.gain for f, new in zip(frames, free, strict=True)])
     known = np.log(gains)[seen.frame] - np.einsum("mct,mt->mc", lenses[seen.frame], seen.terms)
-    mine = np.flatnonzero(free[seen.frame])
-    at = (np.cumsum(free) - 1)[seen.frame[mine]]
-    design = sparse.csr_matrix((-np.ones(len(mine)), (mine, at)), shape=(len(seen.frame), int(free.sum())))
-    prior = np.full(design.shape[1], params.gain_sigma**-2)
-    even, few = replace(seen, log=seen.log + known), design.shape[1] <= FEW
-    answer = _reweighted(
-        design.toarray() if few else design, even, prior, params, _densely if few else _sparsely
-    )
-    return np.asarray(np.round(np.exp(answer), 5), float)
-
-
-def _reweighted(
-    design: Design, seen: _Sightings, prior: Array, params: ExposureParams, solve: Solver
-) -> Array:
-    """The answer for which log light = point + design @ answer, when few may lie: iteratively reweighted."""
-    answer, weight = np.zeros((design.shape[1], 3)), np.ones(len(seen.frame))
-    for turn in range(params.iterations):
-        answer = solve(design, seen, weight / params.noise**2, prior)
-        left = seen.log - design @ answer
-        mean = seen.sums(weight[:, None] * left) / seen.sums(weight)[:, None]
-        off = ((left - mean[seen.point]) ** 2).mean(1)
-        scale = max(params.outlier, params.doubt / 2**turn)
-        weight = 1 / (1 + off / scale**2) ** 2
-    return answer
-
-
-def _sparsely(design: Design, seen: _Sightings, weight: Array, prior: Array) -> Array:
-    """Weighted least squares with one free brightness per point and channel, eliminated beforehand."""
-    weighted = sparse.diags(weight) @ design
-    points = sparse.csr_matrix((np.ones(len(weight)), (seen.point, np.arange(len(weight)))))
-    share = (points @ weighted).tocsr()
-    inverse = sparse.diags(1 / seen.sums(weight))
-    normal = (design.T @ weighted - share.T @ inverse @ share + sparse.diags(prior)).tocsc()
-    right = weighted.T @ seen.log - share.T @ (inverse @ seen.sums(weight[:, None] * seen.log))
-    # Symmetric positive definite: no pivoting, or SuperLU takes forty times as long.
-    factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return np.asarray(factor.solve(right))
-
-
-def _densely(design: Design, seen: _Sightings, weight: Array, prior: Array) -> Array:
-    """The same for a handful of frames."""
-    weighted = weight[:, None] * design
-    share, total = seen.sums(weighted), seen.sums(weight)[:, None]
-    normal = design.T @ weighted - share.T @ (share / total) + np.diag(prior)
-    right = weighted.T @ seen.log - share.T @ (seen.sums(weight[:, None] * seen.log) / total)
-    return np.asarray(np.linalg.solve(normal, right))
+    gain, count = np.where(free, np.cumsum(free) - 1, -1)[seen.frame], int(free.sum())
+    nobody = np.zeros(len(gain), np.int64)
+    design = Dense(gain, count) if count <= FEW else Sparse(gain, count, nobody, 0, np.zeros((len(gain), 0)))
+    even, prior = replace(seen, log=seen.log + known), np.full(count, params.gain_sigma**-2)
+    return np.asarray(np.round(np.exp(reweighted(design, even, prior, params)), 5), float)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from core.coverage import pass_pixels
 from core.grid import TILE_PX
 from core.matching import PairMatch
-from core.mosaic import Layout, lay_out, solved
+from core.mosaic import Layout, solved
 from core.pose_graph import GraphFrame, place
 from core.scale import KnownScale
 from core.submaps import joins
@@ -232,8 +232,7 @@ def _solved_again(mission: Mission, known: Known) -> tuple[Layout, dict[TileId, 
     """All that were ever read: what came since may tie in a frame that had no place before."""
     before = known.layout
     found, graph = solving.again(mission, known)
-    look = solving.glances(mission.id)
-    after = lay_out(found, known.camera_keys, look, mission.drawn_side, before, mission.mode)
+    after = solving.laid_out(mission, known.camera_keys, found, before)
     if before and before.zoom and (before.zoom, before.fusion) != (after.zoom, after.fusion):
         dirty = everything(after, _published(mission.id))
     else:
@@ -291,7 +290,7 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
     points = surveyed.points_of(mission.id)
     found, submaps = solved(list(graph.values()), pairs_of_all, KnownScale.from_json(mission.scale), points)
     keys = {k: f.meta.camera_key for k, f in graph.items()}
-    layout = lay_out(found, keys, solving.glances(mission.id), mission.drawn_side, mode=mission.mode)
+    layout = solving.laid_out(mission, keys, found)
     update = replace(
         update_of(layout, keys),
         dirty=everything(layout, _published(mission.id)),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import ctypes
+from collections.abc import Callable, Collection, Mapping
 
 from core.glance import Glance, glance
 from core.matching import PairMatch
-from core.mosaic import solved
+from core.mosaic import Layout, lay_out, solved
 from core.pose_graph import Solution
 from core.scale import KnownScale
 from core.submaps import SubmapGraph
@@ -21,6 +22,7 @@ from workers.posing import Known
 _glances = BytesLru(settings.photo_cache_bytes // 2)
 """A sequencer draws no tiles: what others hold photos with holds the glances of every solve."""
 _OVERHEAD_BYTES = 400
+_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
 
 
 def matches(mission_id: str, touching: Collection[str] | None) -> list[PairMatch]:
@@ -51,3 +53,20 @@ def again(mission: Mission, known: Known) -> tuple[Solution, SubmapGraph]:
     accepted = [m for m in accepted if {m.low, m.high} <= known.seen.keys()]  # one's photo may be lost
     seen, points = [known.seen[k] for k in sorted(known.seen)], surveyed.points_of(mission.id)
     return solved(seen, Canonical((), (), tuple(accepted)), KnownScale.from_json(mission.scale), points)
+
+
+def laid_out(
+    mission: Mission, camera_keys: Mapping[str, str], found: Solution, before: Layout | None = None
+) -> Layout:
+    """Where and how bright every frame is drawn. Raises ObjectNotFound."""
+    _settle()
+    side, mode = mission.drawn_side, mission.mode
+    layout = lay_out(found, camera_keys, glances(mission.id), side, before, mode)
+    _settle()
+    return layout
+
+
+def _settle() -> None:
+    """Hand back what a solve of thousands of photos took, which the allocator would keep for the next one."""
+    if _TRIM is not None:
+        _TRIM(0)

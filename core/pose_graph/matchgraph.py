@@ -17,6 +17,8 @@ from core.pose_graph.residuals import Edges, IntArray
 from core.pose_graph.sparse import ComplexArray
 
 GRID = 8
+_AT_ONCE = 1024
+"""Pairs thinned together: all of a mission's points are several times as many as are kept."""
 
 
 def edges_of(
@@ -34,18 +36,25 @@ def edges_of(
     }
     ordered = [chosen[key] for key in sorted(chosen)]
     pairs = np.array([(index[m.low], index[m.high]) for m in ordered], np.int64).reshape(-1, 2)
-    count = np.array([len(m.uv_low) for m in ordered], np.int64)
-    edge = np.repeat(np.arange(len(ordered)), count)
     axis = np.array([(c.cx, c.cy) for c in cameras]).reshape(-1, 2)[camera]
     size = np.array([(c.width, c.height) for c in cameras], float).reshape(-1, 2)[camera]
-    low = np.concatenate([m.uv_low for m in ordered]) if ordered else np.zeros((0, 2))
-    high = np.concatenate([m.uv_high for m in ordered]) if ordered else np.zeros((0, 2))
-    keep = spread(low / size[pairs[edge, 0]], edge, params.points_per_edge)
-    edge, uv = edge[keep], np.column_stack((low[keep], high[keep])).astype(float)
+    blocks = range(0, len(ordered), _AT_ONCE)
+    thin = [_thinned(ordered[k : k + _AT_ONCE], size[pairs[k : k + _AT_ONCE, 0]], params) for k in blocks]
+    kept = np.concatenate([count for count, _ in thin]) if thin else np.zeros(0, np.int64)
+    uv = np.concatenate([points for _, points in thin]) if thin else np.zeros((0, 4))
+    edge = np.repeat(np.arange(len(ordered)), kept)
     uv -= np.column_stack((axis[pairs[edge, 0]], axis[pairs[edge, 1]]))
-    kept = np.bincount(edge, minlength=len(ordered))
     starts = np.concatenate(([0], np.cumsum(kept))).astype(np.int64)
     return Edges(pairs, starts, uv, np.minimum(1.0, params.independent_points / np.maximum(kept, 1)), camera)
+
+
+def _thinned(some: Sequence[PairMatch], size: Array, params: PoseParams) -> tuple[IntArray, Array]:
+    """How many points of each pair are kept, and which: (M, 4) pixels. `size` (E, 2) of the first photos."""
+    edge = np.repeat(np.arange(len(some)), [len(m.uv_low) for m in some])
+    low, high = np.concatenate([m.uv_low for m in some]), np.concatenate([m.uv_high for m in some])
+    keep = spread(low / size[edge], edge, params.points_per_edge)
+    kept = np.bincount(edge[keep], minlength=len(some)).astype(np.int64)
+    return kept, np.column_stack((low[keep], high[keep])).astype(float)
 
 
 def spread(where: Array, group: IntArray, limit: int) -> NDArray[np.int64]:

@@ -337,14 +337,14 @@ def test_a_sequencer_that_was_replaced_writes_nothing(
     for _ in range(6):
         name, args = bench.queue.pop(0)
         bench.handle(name, *args)
-    lay_out = sequence.lay_out
+    lay_out = sequence.solving.lay_out
 
     def slowly(*args: Any, **more: Any) -> Any:
         with bench.db.write() as tx:  # meanwhile the lease has run out and another one has it
             assert leases.acquire(tx, bench.mission_id, "another", 60, now=2e12) is not None
         return lay_out(*args, **more)
 
-    monkeypatch.setattr(sequence, "lay_out", slowly)
+    monkeypatch.setattr(sequence.solving, "lay_out", slowly)
     with pytest.raises(LeaseLost):
         bench.handle("sequence", bench.mission_id)
     with bench.db.read() as tx:
