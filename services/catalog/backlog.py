@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from sqlalchemy import ColumnElement, Integer, bindparam, func, or_, select, tuple_
+from sqlalchemy import ColumnElement, Integer, bindparam, func, or_, select
 from sqlalchemy.orm import Session
 
-from services.catalog.rows import chunks, clock, mission, table
+from services.catalog.rows import among, chunks, clock, mission, table
 from services.catalog.tiles import HEAL, Key, Render, waiting
 from services.tables import DirtyTile, Frame, Tile
 
@@ -105,7 +105,7 @@ def unrendered(tx: Session, mission_id: str, keys: Collection[Key]) -> Mapping[K
     for some in chunks(sorted((z, x, y) for z, x, y in keys)):
         query = select(DirtyTile).where(
             DirtyTile.mission_id == mission_id,
-            tuple_(DirtyTile.z, DirtyTile.x, DirtyTile.y).in_(some),
+            among(DirtyTile, some),
             _to_do(),
         )
         for row in tx.scalars(query.execution_options(populate_existing=True)):
@@ -119,7 +119,7 @@ def unrendered(tx: Session, mission_id: str, keys: Collection[Key]) -> Mapping[K
 def _published(tx: Session, mission_id: str, keys: Sequence[Key]) -> Mapping[Key, Render]:
     found: dict[Key, Render] = {}
     for some in chunks(keys):
-        query = select(Tile).where(Tile.mission_id == mission_id, tuple_(Tile.z, Tile.x, Tile.y).in_(some))
+        query = select(Tile).where(Tile.mission_id == mission_id, among(Tile, some))
         for t in tx.scalars(query.execution_options(populate_existing=True)):
             picture = (t.object_key, t.etag, t.media_type, t.size_bytes, t.inputs)
             found[t.z, t.x, t.y] = Render((t.z, t.x, t.y), t.generation, *picture)

@@ -8,13 +8,13 @@ from functools import lru_cache
 from itertools import islice
 from typing import Any, TypeVar, cast
 
-from sqlalchemy import Table, bindparam, inspect, select
+from sqlalchemy import ColumnElement, Table, and_, bindparam, inspect, select, tuple_
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 from sqlalchemy.orm.attributes import set_committed_value
 
 from services.errors import MissionNotFound
-from services.tables import Base, Mission
+from services.tables import Base, DirtyTile, Mission, Tile
 
 T = TypeVar("T")
 
@@ -91,6 +91,17 @@ def insert_into(dialect: str, model: type[Base]) -> postgresql.Insert:
 def insert(tx: Session, model: type[Base]) -> postgresql.Insert:
     """An INSERT that knows ON CONFLICT, in the words of this transaction's database."""
     return insert_into(tx.get_bind().dialect.name, model)
+
+
+def among(of: type[Tile | DirtyTile], keys: Collection[tuple[int, int, int]]) -> ColumnElement[bool]:
+    """Whether a row of a mission's is one of these tiles.
+
+    SQLite finds one tuple by its index; for several it would read all tiles of the mission, so that it is
+    told where they lie.
+    """
+    zs, xs, ys = (set(column) for column in zip(*keys, strict=True))
+    near = and_(of.z.in_(sorted(zs)), of.x.in_(sorted(xs)), of.y.between(min(ys), max(ys)))
+    return and_(near, tuple_(of.z, of.x, of.y).in_(sorted(keys)))
 
 
 def chunks(items: Collection[T]) -> Iterator[Sequence[T]]:

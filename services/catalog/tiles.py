@@ -27,7 +27,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import Session
 
 from services.catalog import events
-from services.catalog.rows import chunks, clock, hold, insert, lock, mission, table
+from services.catalog.rows import among, chunks, clock, hold, insert, lock, mission, table
 from services.errors import RevisionConflict
 from services.tables import DirtyTile, Frame, FramePose, Tile, TileVersion
 
@@ -161,7 +161,8 @@ def claim_dirty(
         total += count
     claimed: list[DirtyTile] = []
     for some in chunks(chosen):
-        claimed += _claim_blocks(tx, and_(free, tuple_(*block).in_(some)), now)
+        siblings = {(z, 2 * bx + k, 2 * by + j) for z, bx, by in some for k in (0, 1) for j in (0, 1)}
+        claimed += _claim_blocks(tx, and_(free, among(DirtyTile, siblings)), now)
     rank = {key: i for i, key in enumerate(chosen)}
     return sorted(claimed, key=lambda d: (rank[d.z, d.x >> 1, d.y >> 1], d.x, d.y))
 
@@ -290,7 +291,7 @@ def current(tx: Session, mission_id: str, keys: Collection[Key]) -> Mapping[Key,
     for some in chunks(sorted({(z, x, y) for z, x, y in keys})):
         query = (
             select(Tile)
-            .where(Tile.mission_id == mission_id, tuple_(Tile.z, Tile.x, Tile.y).in_(some))
+            .where(Tile.mission_id == mission_id, among(Tile, some))
             .execution_options(populate_existing=True)
         )
         found |= {(row.z, row.x, row.y): _stored(row) for row in tx.scalars(query)}
