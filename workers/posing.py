@@ -181,19 +181,28 @@ def exposed(
 ) -> Layout:
     """The layout with its new frames as bright as what they overlap, until the next balance of all."""
     new = [layout.frames[k] for k in sorted(set(new_ids) & layout.frames.keys())]
-    near = {k for frame in new for k in _alike(frame, layout.frames, set(new_ids), matches)}
+    ties = _ties(layout.frames.keys() & set(new_ids), matches)
+    near = {k for frame in new for k in _alike(frame, layout.frames, set(new_ids), ties[frame.frame_id])}
     colours = {k: look(k).colours for k in sorted(near | {f.frame_id for f in new})}
     lit = fitted(new, [layout.frames[k] for k in sorted(near)], colours)
     return replace(layout, frames={**layout.frames, **{f.frame_id: f for f in lit}})
 
 
+def _ties(ids: Collection[str], matches: Iterable[PairMatch]) -> dict[str, list[tuple[int, str]]]:
+    """Whom each of these frames is matched with, and how well: the best has the lowest rank."""
+    ties: dict[str, list[tuple[int, str]]] = {k: [] for k in ids}
+    for m in matches:
+        for one, other in ((m.low, m.high), (m.high, m.low)) if m.accepted else ():
+            if one in ties:
+                ties[one].append((-len(m.uv_low), other))
+    return ties
+
+
 def _alike(
-    frame: PosedFrame, frames: Mapping[str, PosedFrame], new_ids: set[str], matches: Sequence[PairMatch]
+    frame: PosedFrame, frames: Mapping[str, PosedFrame], new_ids: set[str], ties: Iterable[tuple[int, str]]
 ) -> list[str]:
     """A few of those that are not new and show the same ground: the best matched, or else the nearest."""
-    mine = [m for m in matches if m.accepted and frame.frame_id in (m.low, m.high)]
-    found = [(-len(m.uv_low), m.high if m.low == frame.frame_id else m.low) for m in mine]
-    found = [(rank, k) for rank, k in found if k in frames and k not in new_ids]
+    found = [(rank, k) for rank, k in ties if k in frames and k not in new_ids]
     if found:
         return [k for _, k in sorted(found)[:EXPOSED_BY]]
     others = sorted(frames.keys() - new_ids)
