@@ -22,7 +22,7 @@ from services.queue import send
 from services.tables import Frame, Mission
 from workers import solving, surveyed, tying, wanted, warmup
 from workers.app import CLAIM_TTL_S, Stopwatch, app, before_the_fork, db, log, settings, stage
-from workers.dealing import AHEAD_TILES, runs, tasks
+from workers.dealing import AHEAD_TILES, BEGIN, LIVE_TILES, LiveBatch, Spent, live_runs, runs, tasks
 from workers.lease import held
 from workers.posing import Known, changed, everything, exposed, joined, lifts, sharper, update_of
 
@@ -35,19 +35,14 @@ SPARE = 6
 LIVE_SHARE = 0.85
 """What may be rendered before the final pass, as a share of that pass."""
 FEW = 8
-LIVE_TILES = 12
 WORTH_A_LOOK = 24
 """While so many photos still wait to be read, a mission that is being finished grows live as well."""
-REST_CORE_S = 20.0
-"""Between batches of the live map so much is worked on photos that wait to be read: it grows, and they go on,
-with few workers as with many.
-"""
 _REMEMBERED = 8
 IDLE = Backlog(0, 0, 0, 0, 0)
 
 _known: dict[str, Known] = {}
 _come_back: dict[str, float] = {}
-_rested: dict[str, float] = {}
+_batches: dict[str, LiveBatch] = {}
 
 
 before_the_fork(warmup.solving)
@@ -84,8 +79,8 @@ def _waits(mission_id: str) -> bool:
         return False
     if mission.state == "open" and not (desk.matched or desk.to_render or desk.to_publish):
         return _may_tie(mission) or (desk == IDLE and _rests(mission))
-    resting = desk.unread > settings.workers and time.monotonic() < _rested.get(mission_id, 0.0)
-    return not resting
+    last = _batches.get(mission_id, BEGIN)
+    return desk.unread <= settings.workers or last.over(time.monotonic(), settings.workers)
 
 
 def _may_tie(mission: Mission) -> bool:
@@ -316,23 +311,25 @@ def _solve_finally(mission: Mission, epoch: int) -> bool:
 
 
 def _dispatch(mission: Mission, desk: Backlog) -> bool:
-    """Hand out tiles, as many at a time as there are workers; one task while photos still wait to be read."""
+    """Hand out tiles: all that there are workers for, or a batch while photos still wait to be read."""
     sharpens = mission.state == "sharpening"
     if mission.final_generation is not None and not sharpens:
         return _deal(mission, desk)
-    busy, size = desk.unread > settings.workers, LIVE_TILES
-    room = size * (1 if busy else settings.workers) - desk.in_flight
-    now = time.monotonic()
-    if room <= 0 or (busy and now < _rested.get(mission.id, 0.0)):
+    now, spent, busy = time.monotonic(), Spent.of(mission.stage_seconds), desk.unread > settings.workers
+    last = _batches.get(mission.id, BEGIN)
+    if busy:
+        drawn = not desk.in_flight and last.over(now, settings.workers)
+        room = last.next_tiles(desk.to_render, spent) if drawn else 0
+    else:
+        room = LIVE_TILES * settings.workers - desk.in_flight
+    if room <= 0:
         return False
-    _rested[mission.id] = now + REST_CORE_S / settings.workers
     with db.write() as tx:
         claimed = tiles.claim_dirty(tx, mission.id, room, CLAIM_TTL_S, by_place=sharpens)
     keys = [(d.z, d.x, d.y) for d in claimed]
-    if not busy:  # few tiles are shared out evenly, so that they are there soon
-        size = min(size, max(4, -(-len(keys) // settings.workers)))
-    for start in range(0, len(keys), size):
-        send("fuse", mission.id, keys[start : start + size], priority=SPARE if sharpens else None)
+    _batches[mission.id] = LiveBatch(now, len(keys), spent)
+    for run in live_runs(keys, settings.workers, busy):
+        send("fuse", mission.id, run, priority=SPARE if sharpens else None)
     return False
 
 

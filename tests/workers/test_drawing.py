@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from services.catalog import frames, missions
+from services.catalog import backlog, frames, missions, tiles
+from services.catalog.tiles import Render
 from services.report import report
 from services.tables import Tile
 
@@ -104,3 +106,36 @@ def test_another_finalising_of_the_same_photos_draws_nothing(bench: Any, photos:
     bench.drain()
     assert bench.state == "final"
     assert pixels(bench) == before
+
+
+def dealt(bench: Any) -> list[list[tuple[int, int, int]]]:
+    """The runs of tiles that are handed out now, with 500 photos still to be read."""
+    with bench.db.read() as tx:
+        mission = missions.get(tx, bench.mission_id)
+        desk = replace(backlog.of(tx, bench.mission_id, 30), unread=500)
+    bench.modules["sequence"]._dispatch(mission, desk)
+    found = [args[1] for name, args in bench.queue if name == "fuse"]
+    bench.queue.clear()
+    return found
+
+
+def test_while_photos_wait_more_is_drawn_live_the_more_waits_as_long_as_that_is_cheap(
+    bench: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.dealing.REST_CORE_S", 0.0)
+    with bench.db.write() as tx:
+        tiles.mark_dirty(tx, bench.mission_id, [(20, x, y) for x in range(24) for y in range(20)], 1)
+
+    def drawn(runs: list[list[tuple[int, int, int]]], reading_s: float, drawing_s: float) -> int:
+        keys = [key for run in runs for key in run]
+        with bench.db.write() as tx:
+            tiles.record_renders(tx, bench.mission_id, [Render(key, 1) for key in keys])
+            missions.spend(tx, bench.mission_id, "ingest", reading_s)
+            missions.spend(tx, bench.mission_id, "fuse", drawing_s)
+        return len(keys)
+
+    first = dealt(bench)
+    assert dealt(bench) == []  # until these are drawn
+    assert (len(first), drawn(first, 10.0, 0.1)) == (1, 12)  # drawn by one worker
+    assert drawn(dealt(bench), 10.0, 50.0) == (480 - 12) // 3
+    assert drawn(dealt(bench), 0.0, 0.0) == 12
