@@ -75,7 +75,7 @@ def test_whoever_asks_now_and_then_gets_to_know_all_and_reads_each_once(
 
     def note(_conn: object, _cursor: object, statement: str, parameters: object, *_: object) -> None:
         if "frames.meta" in statement.split("FROM")[0]:
-            read_of.extend(names[k] for k in range(40) if names[k] in repr(parameters))
+            read_of.extend(name for name in names if repr(name) in repr(parameters))
 
     known: set[str] = set()
     newest: float | None = None
