@@ -8,12 +8,12 @@ import { Panel, type LegendEntry } from "./panel";
 import { dropTarget, tallyText, Uploads } from "./uploads";
 
 const NARROW = matchMedia("(max-width: 760px)");
-// How much of the time footprints may take to fetch: a large mission refreshes them more rarely.
+// How many times as long as footprints took to fetch they are left alone: a large mission's more rarely.
 const FETCH_SHARE = 10;
 const FETCH_EVERY_MS = 1000;
 
 /** Runs `work` soon, never twice at once, and not more often than it can bear. */
-function throttled(work: () => Promise<void>): () => void {
+function throttled(work: () => Promise<void>, share = FETCH_SHARE): () => void {
   let timer = 0;
   let pending = false;
   let running = false;
@@ -24,7 +24,7 @@ function throttled(work: () => Promise<void>): () => void {
     pending = false;
     const start = performance.now();
     await work().catch(() => undefined);
-    pause = Math.max(FETCH_EVERY_MS, FETCH_SHARE * (performance.now() - start));
+    pause = Math.max(FETCH_EVERY_MS, share * (performance.now() - start));
     running = false;
     if (pending) timer = window.setTimeout(() => void run(), pause);
   };
@@ -82,6 +82,7 @@ export class MissionPage {
   private live: Live | null = null;
   private gone = false;
   private placed = false;
+  private exports: ExportDoc[] = [];
   // Being asked for, and what the server has begun to make then.
   private readonly asking = new Set<string>();
   private readonly awaited = new Set<string>();
@@ -91,7 +92,7 @@ export class MissionPage {
   private rejectedListed = 0;
   private submapsAsOf = -1;
   private readonly refreshSubmaps = throttled(() => this.loadSubmaps());
-  private readonly refreshExports = throttled(() => this.loadExports());
+  private readonly refreshExports = throttled(() => this.loadExports(), 1);  // a short list, and somebody waits for it
   private readonly refreshMission = throttled(() => this.loadMission());
 
   constructor(root: HTMLElement, mission: Mission, private readonly uploads: Uploads) {
@@ -227,12 +228,18 @@ export class MissionPage {
       if (doc.state === "ready" && this.awaited.delete(doc.name)) void this.download(doc);
       if (doc.state === "failed" && this.awaited.delete(doc.name)) this.say(doc.error ?? "This file could not be made.");
     }
-    const made = exports.filter((doc) => doc.state === "wanted").map((doc) => doc.name);
-    this.panel.setExports(exports, new Set([...made, ...this.asking, ...this.awaited]));
+    this.exports = exports;
+    this.showExports();
+  }
+
+  private showExports(): void {
+    const made = this.exports.filter((doc) => doc.state === "wanted").map((doc) => doc.name);
+    this.panel.setExports(this.exports, new Set([...made, ...this.asking, ...this.awaited]));
   }
 
   private async download(doc: ExportDoc): Promise<void> {
     this.asking.add(doc.name);
+    this.showExports();
     try {
       if ((await api.wantExport(doc)) === "wanted") this.awaited.add(doc.name);
       else h("a", { href: doc.url, download: doc.name }).click();
@@ -240,6 +247,7 @@ export class MissionPage {
       this.say(error instanceof Problem ? (doc.error ?? error.message) : OFFLINE);
     }
     this.asking.delete(doc.name);
+    this.showExports();
     this.refreshExports();
   }
 
