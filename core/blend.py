@@ -65,7 +65,7 @@ def label_level(
     px, only photos whose `sizes` (photos, 2) hold the pixel count, so that the mosaic ends where photos end.
     """
     rows, cols = knot_labels.shape
-    out = np.full((rows * pixels_per_cell, cols * pixels_per_cell), NOBODY, np.int16)
+    out = np.empty((rows * pixels_per_cell, cols * pixels_per_cell), np.int16)
     strict = places is not None
     no_places = np.empty((1, 1, 1, 2), np.int32)
     _label(knot_labels, weights, pixels_per_cell, strict, no_places if places is None else places, sizes, out)
@@ -231,6 +231,8 @@ def _label(
     """Patch by patch between knots, in whole numbers: bilinear weights, scaled by (2n)²."""
     best, chosen = np.empty(n, np.int64), np.empty(n, np.int16)
     found, ends, bounds = np.empty(4, np.int64), np.zeros((3, 2), np.int64), np.zeros(2, np.int64)
+    for y in range(len(out)):
+        out[y] = NOBODY
     for j in range(knot_labels.shape[0] - 1):
         for i in range(knot_labels.shape[1] - 1):
             y0, x0 = j * n + n // 2, i * n + n // 2

@@ -44,7 +44,9 @@ class Columns(NamedTuple):
 
 
 def plumb_lines(world: World, lon_deg: Array, lat_deg: Array) -> Columns:
-    """The ellipsoid's normals at (N,) longitudes and latitudes, as lines in the world.
+    """The ellipsoid's normals at longitudes and latitudes, as lines in the world.
+
+    These are (N,) each, or (1, C) and (R, 1): then the lines of all R × C crossings are given, row by row.
 
     Every operation is elementwise (no matrix product, whose rounding may depend on N), so that a point gets
     the same bits whichever others are asked for along with it.
@@ -68,9 +70,9 @@ def plumb_lines(world: World, lon_deg: Array, lat_deg: Array) -> Columns:
 
     height = cp * (cl * dx + sl * dy) + sp * dz
     rise = cp * (cl * up_x + sl * up_y) + sp * up_z
-    slope = np.column_stack((east(up_x, up_y) / rise, north(up_x, up_y, up_z) / rise))
-    foot = np.column_stack((east(dx, dy), north(dx, dy, dz))) - slope * height[:, None]
-    return Columns(foot, slope)
+    slope = np.stack((east(up_x, up_y) / rise, north(up_x, up_y, up_z) / rise), -1)
+    foot = np.stack((east(dx, dy), north(dx, dy, dz)), -1) - slope * height[..., None]
+    return Columns(foot.reshape(-1, 2), slope.reshape(-1, 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +90,11 @@ class _Window:
     def columns(self, world: World, cols: ArrayLike, rows: ArrayLike) -> Columns:
         """The plumb lines through absolute pixel positions (N,)."""
         return plumb_lines(world, *self.lon_lat(cols, rows))
+
+    def crossings(self, world: World, cols: ArrayLike, rows: ArrayLike) -> Columns:
+        """The plumb lines through all crossings of columns (C,) and rows (R,), row by row (R · C)."""
+        x, y = np.meshgrid(cols, rows)
+        return self.columns(world, x.ravel(), y.ravel())
 
     def to_world(self, world: World, cols: ArrayLike, rows: ArrayLike, h_m: float) -> Array:
         """Absolute pixel positions (N,) → world x, y (N, 2), metres, on the plane at world height `h_m`."""
@@ -116,6 +123,11 @@ class MercatorGrid(_Window):
         x = (np.asarray(cols, float) + 0.5) / side
         y = (np.asarray(rows, float) + 0.5) / side
         return 360 * x - 180, np.degrees(np.arctan(np.sinh(math.pi * (1 - 2 * y))))
+
+    def crossings(self, world: World, cols: ArrayLike, rows: ArrayLike) -> Columns:
+        """As for any grid, but here a column is one longitude and a row one latitude."""
+        lon, lat = self.lon_lat(cols, rows)
+        return plumb_lines(world, lon[None], lat[:, None])
 
     def from_world(self, world: World, xy: ArrayLike, h_m: float) -> tuple[Array, Array]:
         """World x, y (N, 2), metres, at world height `h_m` → absolute (columns, rows), (N,) each."""

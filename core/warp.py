@@ -65,11 +65,9 @@ class Lattice:
         cols = -(-(grid.col0 + grid.width) // cell_px) + pad - left
         rows = -(-(grid.row0 + grid.height) // cell_px) + pad - top
         centre = (cell_px - 1) / 2
-        x, y = np.meshgrid(
-            (left + np.arange(cols)) * float(cell_px) + centre,
-            (top + np.arange(rows)) * float(cell_px) + centre,
-        )
-        columns = grid.columns(world, x.ravel(), y.ravel())
+        x = (left + np.arange(cols)) * float(cell_px) + centre
+        y = (top + np.arange(rows)) * float(cell_px) + centre
+        columns = grid.crossings(world, x, y)
         return cls(left * cell_px, top * cell_px, cols, rows, cell_px, columns)
 
 

@@ -47,6 +47,20 @@ def test_ground_to_pixel_and_back(world: World, xy: tuple[float, float], h_m: fl
         np.testing.assert_allclose(grid.to_world(world, cols, rows, h_m), [xy], atol=2e-5)
 
 
+@given(PLACES, st.integers(14, 23), st.integers(1, 70), st.integers(1, 70), st.integers(1, 64))
+@settings(deadline=None, max_examples=50)
+def test_a_lattice_has_the_plumb_lines_of_its_points(
+    world: World, z: int, width: int, height: int, step: int
+) -> None:
+    cols, rows = 16.5 + step * np.arange(width), 7.5 + step * np.arange(height)
+    for grid in (MercatorGrid(z, 0, 0, 1, 1), utm(world)):
+        left, top = (np.floor(v[0]) for v in grid.from_world(world, [[0.0, 0.0]], 0.0))
+        x, y = (v.ravel() for v in np.meshgrid(left + cols, top + rows))
+        lattice, points = grid.crossings(world, left + cols, top + rows), grid.columns(world, x, y)
+        assert np.array_equal(lattice.foot, points.foot)
+        assert np.array_equal(lattice.slope, points.slope)
+
+
 @pytest.mark.parametrize("world", [NORTH, SOUTH])
 def test_pixels_lie_where_the_geodesy_says(world: World) -> None:
     grid = utm(world)
