@@ -6,6 +6,7 @@ import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import rasterio
@@ -46,11 +47,23 @@ class Preview:
         """The CRS in the words of .prj files, which world files lack."""
         return str(CRS.from_epsg(self.epsg).to_wkt("WKT1_ESRI"))
 
+    def beside(self) -> str:
+        """The CRS where GDAL, and with it QGIS, looks for it: in no .prj file next to a PNG."""
+        root = ET.Element("PAMDataset")
+        ET.SubElement(root, "SRS").text = str(CRS.from_epsg(self.epsg).to_wkt("WKT2_2019"))
+        return ET.tostring(root, "unicode")
+
 
 def write_preview(path: Path, preview: Preview) -> None:
-    """A zip at `path` with preview.png, its world file and its CRS."""
-    texts = (("preview.pgw", preview.world_file()), ("preview.prj", preview.projection()))
-    write_zip(path, [("preview.png", preview.png()), *((name, text.encode()) for name, text in texts)])
+    """A zip at `path` with preview.png, its world file and its CRS, in the two ways that programs read it."""
+    texts = {
+        "preview.pgw": preview.world_file(),
+        "preview.prj": preview.projection(),
+        "preview.png.aux.xml": preview.beside(),
+    }
+    write_zip(
+        path, [("preview.png", preview.png()), *((name, text.encode()) for name, text in texts.items())]
+    )
 
 
 def preview(tiles: TileSet, epsg: int, long_side_px: int = LONG_SIDE_PX) -> Preview:

@@ -337,6 +337,20 @@ def test_the_world_file_puts_the_preview_where_the_tiles_are(
     assert picture[round((y - f) / e), round((x - c) / a), 3] == 0
 
 
+def test_gdal_sees_the_preview_where_the_world_file_puts_it(
+    tmp_path: Path, tiles: dict[TileKey, bytes]
+) -> None:
+    """Unpacked, it needs nobody to say which CRS it is in."""
+    shown = preview(of_bytes(tiles), EPSG)
+    write_preview(tmp_path / "preview.zip", shown)
+    with zipfile.ZipFile(tmp_path / "preview.zip") as file:
+        file.extractall(tmp_path)
+    with rasterio.open(tmp_path / "preview.png") as raster:
+        assert raster.crs.to_epsg() == EPSG
+        assert raster.transform.almost_equals(shown.transform, 1e-6)
+        np.testing.assert_array_equal(raster.read(), shown.rgba.transpose(2, 0, 1))
+
+
 def test_a_preview_is_never_larger_than_the_map_has_pixels() -> None:
     tile = TileKey(ZOOM, X0, Y0)
     shown = preview(of_bytes({tile: native(tile, opaque=True)}), EPSG)
