@@ -20,6 +20,10 @@ LIVE_PART, LIVE_COST = 1 / 3, 1 / 6
 more than so much of the work that reading took meanwhile. Not all of it: tiles at the edge of what was flown
 over are soon dirty again, and the longer they wait the more of them is drawn at a time.
 """
+LIVE_WORTH = 16
+"""No more than one tile is drawn live for so many photos and tiles that wait: where few do, the end is near
+and shows all of them.
+"""
 REST_CORE_S = 20.0
 """Between batches of the live map so much is worked on photos that wait to be read: it grows, and they go on,
 with few workers as with many. A burst that is read in that time loses nothing by being watched.
@@ -52,13 +56,16 @@ class LiveBatch:
         """Whether photos were read for long enough since."""
         return now_s >= self.at_s + REST_CORE_S / workers
 
-    def next_tiles(self, waiting: int, spent: Spent) -> int:
-        """How many of so many tiles that wait the next batch draws, each for what one of this batch took."""
+    def next_tiles(self, waiting: int, unread: int, spent: Spent) -> int:
+        """How many of the `waiting` tiles the next batch draws, each for what one of this batch took, while
+        `unread` photos wait.
+        """
         drawing_s = spent.drawing_s - self.before.drawing_s
         if self.tiles == 0 or drawing_s <= 0:
             return LIVE_TILES
         affordable = LIVE_COST * (spent.reading_s - self.before.reading_s) * self.tiles / drawing_s
-        return max(LIVE_TILES, min(math.ceil(LIVE_PART * waiting), int(affordable)))
+        worth = (waiting + unread) // LIVE_WORTH
+        return max(LIVE_TILES, min(math.ceil(LIVE_PART * waiting), int(affordable), worth))
 
 
 BEGIN = LiveBatch(-math.inf, 0, Spent(0.0, 0.0))

@@ -319,7 +319,7 @@ def _dispatch(mission: Mission, desk: Backlog) -> bool:
     last = _batches.get(mission.id, BEGIN)
     if busy:
         drawn = not desk.in_flight and last.over(now, settings.workers)
-        room = last.next_tiles(desk.to_render, spent) if drawn else 0
+        room = last.next_tiles(desk.to_render, desk.unread, spent) if drawn else 0
     else:
         room = LIVE_TILES * settings.workers - desk.in_flight
     if room <= 0:

@@ -14,6 +14,7 @@ from workers.dealing import (
     LIVE_COST,
     LIVE_PART,
     LIVE_TILES,
+    LIVE_WORTH,
     LONGEST,
     MOST_PAIRS,
     REST_CORE_S,
@@ -71,26 +72,41 @@ def after(tiles: int, reading_s: float, tile_s: float) -> tuple[LiveBatch, Spent
     return LiveBatch(0.0, tiles, Spent(3.0, 50.0)), Spent(3.0 + drawing_s, 50.0 + reading_s)
 
 
-@given(st.integers(1, 5000), st.integers(1, 300), st.floats(1e-3, 2.0), st.floats(1.0, 60.0))
+WAITING, TILE_S, READING_S = st.integers(1, 5000), st.floats(1e-3, 2.0), st.floats(1.0, 60.0)
+
+
+@given(WAITING, WAITING, st.integers(1, 300), TILE_S, READING_S)
 def test_the_more_waits_the_more_is_drawn_live_for_no_more_than_its_share_of_the_work(
-    waiting: int, before: int, tile_s: float, reading_s: float
+    waiting: int, unread: int, before: int, tile_s: float, reading_s: float
 ) -> None:
     batch, spent = after(before, reading_s, tile_s)
-    tiles = batch.next_tiles(waiting, spent)
+    tiles = batch.next_tiles(waiting, unread, spent)
     assert tiles >= LIVE_TILES
     if tiles > LIVE_TILES:
         assert tiles <= LIVE_PART * waiting + 1
         assert tiles * tile_s <= LIVE_COST * reading_s + 1e-6
-    assert batch.next_tiles(waiting + 3, spent) >= tiles
+        assert tiles <= (waiting + unread) / LIVE_WORTH
+    assert batch.next_tiles(waiting + 3, unread, spent) >= tiles
+    assert batch.next_tiles(waiting, unread + 3, spent) >= tiles
 
 
 def test_of_many_tiles_that_wait_a_part_is_drawn_and_of_few_or_at_first_a_few() -> None:
     cheap = after(LIVE_TILES, reading_s=20.0, tile_s=0.001)
-    assert [cheap[0].next_tiles(n, cheap[1]) for n in (1, 36, 37, 300, 3000)] == [12, 12, 13, 100, 1000]
+    drawn = [cheap[0].next_tiles(n, 5000, cheap[1]) for n in (1, 36, 37, 300, 900)]
+    assert drawn == [12, 12, 13, 100, 300]
     dear = after(LIVE_TILES, reading_s=20.0, tile_s=0.5)
-    assert dear[0].next_tiles(3000, dear[1]) == LIVE_TILES
-    assert BEGIN.next_tiles(3000, Spent(1.0, 100.0)) == LIVE_TILES
-    assert LiveBatch(0.0, 12, Spent(1.0, 5.0)).next_tiles(3000, Spent(1.0, 9.0)) == LIVE_TILES
+    assert dear[0].next_tiles(3000, 5000, dear[1]) == LIVE_TILES
+    assert BEGIN.next_tiles(3000, 5000, Spent(1.0, 100.0)) == LIVE_TILES
+    unbooked = LiveBatch(0.0, LIVE_TILES, Spent(1.0, 5.0))
+    assert unbooked.next_tiles(3000, 5000, Spent(1.0, 9.0)) == LIVE_TILES
+
+
+@given(st.integers(1, 100), st.integers(0, 100), TILE_S, READING_S)
+def test_a_short_burst_is_not_held_up_by_who_watches_it(
+    waiting: int, unread: int, tile_s: float, reading_s: float
+) -> None:
+    batch, spent = after(LIVE_TILES, reading_s, tile_s)
+    assert batch.next_tiles(waiting, unread, spent) == LIVE_TILES
 
 
 def test_batches_of_the_live_map_follow_each_other_at_the_pace_at_which_photos_are_read() -> None:

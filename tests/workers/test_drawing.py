@@ -109,10 +109,10 @@ def test_another_finalising_of_the_same_photos_draws_nothing(bench: Any, photos:
 
 
 def dealt(bench: Any) -> list[list[tuple[int, int, int]]]:
-    """The runs of tiles that are handed out now, with 500 photos still to be read."""
+    """The runs of tiles that are handed out now, with 5000 photos still to be read."""
     with bench.db.read() as tx:
         mission = missions.get(tx, bench.mission_id)
-        desk = replace(backlog.of(tx, bench.mission_id, 30), unread=500)
+        desk = replace(backlog.of(tx, bench.mission_id, 30), unread=5000)
     bench.modules["sequence"]._dispatch(mission, desk)
     found = [args[1] for name, args in bench.queue if name == "fuse"]
     bench.queue.clear()
