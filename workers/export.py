@@ -242,8 +242,10 @@ def _tiles(mission: Mission, wanted: Export) -> TileSet:
     """The map at the revision that was asked for, however it has grown since. Raises NothingToMap."""
     with db.read() as tx:
         shown = {TileKey(*t.key): t for t in tiles.at(tx, mission.id, wanted.revision)}
-    keys = {key: t.object_key for key, t in shown.items() if t.object_key is not None}
-    kinds = {key: t.media_type or JPEG for key, t in shown.items()}
+    # What is drawn sharper already lies below some of these only: readers would take the rest for empty.
+    finest = mission.zoom or 0
+    keys = {k: t.object_key for k, t in shown.items() if t.object_key is not None and k.z <= finest}
+    kinds = {key: shown[key].media_type or JPEG for key in keys}
     with db.read() as tx:
         local = poses.georeferenced(tx, mission.id) is False
     title = f"{mission.name} (not georeferenced)" if local else mission.name

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from pmtiles.reader import all_tiles
 
 from services.catalog import exports, missions
 from services.tables import Export
@@ -54,6 +55,39 @@ def test_a_file_that_is_made_again_is_another_one(mapped: Any) -> None:
         with mapped.db.write() as tx:
             exports.get(tx, mapped.mission_id, "report.json").state = "failed"
     assert len(names) == 2
+
+
+def test_files_of_a_map_that_sharpens_have_no_holes(
+    bench: Any, photos: list[tuple[str, bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are of the preview's zoom until the sharper one is whole, which readers take for all there is."""
+    monkeypatch.setattr(bench.modules["publish"], "ENOUGH", 1)
+    with bench.db.write() as tx:
+        bench.mission_id = missions.create(tx, "sharpens", "visual", 256, backfill=True).id
+    bench.upload(photos)
+    bench.drain()
+    bench.finalise()
+    whole: set[tuple[int, int, int]] = set()
+    partly = 0
+    while bench.queue:
+        name, args = bench.queue.pop(0)
+        bench.handle(name, *args)
+        if bench.state != "sharpening":
+            continue
+        shown = set(bench.tiles())
+        whole = whole or shown
+        if max(shown) > max(whole) and partly < 3:
+            partly += 1
+            assert tiles_in(bench, ask(bench, "tiles.pmtiles")) == whole
+    assert partly
+    assert max(bench.tiles()) > max(whole)
+    assert tiles_in(bench, ask(bench, "tiles.pmtiles")) == set(bench.tiles())
+
+
+def tiles_in(bench: Any, row: Export) -> set[tuple[int, int, int]]:
+    with bench.modules["app"].store.open(row.object_key) as file:
+        data = file.read()
+    return {(z, x, y) for (z, x, y), _ in all_tiles(lambda start, length: data[start : start + length])}
 
 
 @pytest.mark.parametrize("fails", [False, True])
