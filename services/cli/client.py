@@ -151,10 +151,15 @@ class Client:
         else:
             self._json("PUT", url, content=content.encode(), params={"use": list(use)})
 
-    def want(self, mission_id: str, name: str, crs: str | None = None) -> int:
-        """Has one export made, if it is not there yet; the answer's status."""
-        answer = self._ask("GET", _export_url(mission_id, name, crs), headers={"Range": "bytes=0-0"})
+    def want(self, mission_id: str, name: str, crs: str | None = None, retry: bool = False) -> int:
+        """Has one export made, if it is not there yet; the answer's status. `retry`: also if that failed."""
+        url = _export_url(mission_id, name, crs, retry)
+        answer = self._ask("GET", url, headers={"Range": "bytes=0-0"})
         return 409 if answer.status_code == 409 else self._good(answer).status_code
+
+    def failure(self, mission_id: str, name: str, crs: str | None = None) -> str:
+        """Why an export that cannot be made cannot."""
+        return str(_problem(self._ask("GET", _export_url(mission_id, name, crs))).get("detail") or "")
 
     def download(
         self, mission_id: str, name: str, path: Path, wait: Callable[[], None], crs: str | None = None
@@ -163,16 +168,18 @@ class Client:
 
         `crs`: of the mosaic, where not the mission's UTM zone.
         """
-        while (status := self.want(mission_id, name, crs)) == 202:
+        url, part = _export_url(mission_id, name, crs), path.with_name(path.name + ".part")
+        while (status := self.want(mission_id, name, crs)) != 409:
+            # By the time that the file is asked for a map that grows may have outgrown it.
+            if status != 202 and self._good(self._fetch(url, part)).status_code != 202:
+                part.replace(path)
+                return True
             wait()
             time.sleep(0.25)
-        if status == 409:
-            return False
-        url = _export_url(mission_id, name, crs)
-        part = path.with_name(path.name + ".part")
-        self._good(self._stubbornly(lambda: self._stream(url, part)))
-        part.replace(path)
-        return True
+        return False
+
+    def _fetch(self, url: str, path: Path) -> httpx.Response:
+        return self._stubbornly(lambda: self._stream(url, path))
 
     def _stream(self, url: str, path: Path) -> httpx.Response:
         with self._http.stream("GET", url) as answer:
@@ -223,8 +230,9 @@ class Client:
             self._say(f"{self.url}: {trouble.rstrip('.')}. Trying again for {give_up_at - now:.0f} s more …")
 
 
-def _export_url(mission_id: str, name: str, crs: str | None) -> str:
-    return f"/missions/{mission_id}/exports/{name}" + (f"?crs={crs}" if crs else "")
+def _export_url(mission_id: str, name: str, crs: str | None, retry: bool = False) -> str:
+    asked = ([f"crs={crs}"] if crs else []) + (["retry=true"] if retry else [])
+    return f"/missions/{mission_id}/exports/{name}" + ("?" + "&".join(asked) if asked else "")
 
 
 def _problem(answer: httpx.Response) -> Mapping[str, Any]:

@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from core.errors import NothingToMap, OrthostreamError
-from services.cli.client import Client, Uploaded
+from services.cli.client import Client, Refused, Uploaded
 from services.cli.flight import Photo, identify
 from services.export_names import MOSAIC
 
-EXPORTS = ("poses.json", "report.json", "footprints.geojson", "route.csv", "tiles.pmtiles", MOSAIC)
+_TILES = "tiles.pmtiles"
+EXPORTS = ("poses.json", "report.json", "footprints.geojson", "route.csv", _TILES, MOSAIC)
 PARALLEL = 4
 POLL_S = 0.5
 STUCK_S = 900.0
@@ -195,9 +196,12 @@ def deliver(
     crs: str | None = None,
     tally: Tally | None = None,
 ) -> None:
-    """Downloads the exports of a finished mission. Raises NothingToMap, with what was wrong."""
-    if MOSAIC in fetch(client, mission_id, out, console, crs):
+    """Downloads the exports of a finished mission. Raises NothingToMap or Refused, with what was wrong."""
+    fetched = fetch(client, mission_id, out, console, crs)
+    if MOSAIC in fetched:
         return
+    if _TILES in fetched:  # there is a map
+        raise Refused(f"{MOSAIC} could not be made. {client.failure(mission_id, MOSAIC, crs)}")
     useless = client.frames(mission_id, "rejected") + client.frames(mission_id, "waiting")
     lines = [f"  {f['name']}: {f['reason']}" for f in useless]
     if tally:
@@ -214,7 +218,7 @@ def fetch(client: Client, mission_id: str, out: Path, console: Console, crs: str
         fetched = []
         of = {name: crs if name == MOSAIC else None for name in EXPORTS}
         for name in EXPORTS:
-            client.want(mission_id, name, of[name])  # they are made side by side
+            client.want(mission_id, name, of[name], retry=True)  # they are made side by side
         for name in EXPORTS:
             status.update(f"Writing {name} …")
             if client.download(mission_id, name, out / name, lambda: None, of[name]):
