@@ -32,7 +32,7 @@ from core.grid import Grid
 from core.layers import Canvas
 from core.parts import Photos as Photos
 from core.parts import Share, likely
-from core.seams import REACH_CELLS, settle
+from core.seams import REACH_CELLS, heaviest, settle
 from core.sharpness import give_way
 from core.tone import Gain, relit
 from core.warp import Int32, Lattice, Rgb, Views, look
@@ -218,18 +218,19 @@ class _Scene:
         give_way(views.weight, views.sharp)
         inner = np.s_[:, rim : lattice.rows - rim, rim : lattice.cols - rim]
         given = np.ascontiguousarray(views.weight[inner])
-        drawn = given.any(0) if kept is None else given.any(0) & kept
+        drawn = np.asarray(given.any(0) if kept is None else given.any(0) & kept)
         if not drawn.any():
             return None
-        weights = settle(views.weight, views.spot)[inner] if params.seams else given
-        labels = np.where(drawn, weights.argmax(0), NOBODY).astype(np.int16)
+        settled = settle(views.weight, views.spot)[inner] if params.seams else given
+        weights = np.ascontiguousarray(settled)
+        labels = heaviest(weights, drawn)
         winners = np.unique(labels[labels != NOBODY])
         place = np.full(len(frames) + 1, NOBODY, np.int16)
         place[winners] = np.arange(len(winners))
         return cls(
             frames=[frames[k] for k in winners],
             labels=place[labels],
-            weights=np.ascontiguousarray(weights[winners]),
+            weights=weights[winners],
             retone=retone(labels, given, Tones(views.own, views.even, views.detail), params.tone_tolerance),
         )
 

@@ -143,3 +143,24 @@ def _weigh(cost: Costs, weights: Int32) -> None:
                 if weights[k, y, x] >= INSIDE:
                     claim = min(max(cost[k, y, x], np.float32(-1)), np.float32(1))
                     weights[k, y, x] = INSIDE + np.int32(half * (1 - claim))
+
+
+@compiled
+def heaviest(weights: Int32, drawn: NDArray[np.bool_]) -> NDArray[np.int16]:
+    """Which photo weighs most at each knot that is drawn, the first of equals; elsewhere −1.
+
+    `weights`: (photos, rows, cols); `drawn` and what is returned: (rows, cols).
+    """
+    n, rows, cols = weights.shape
+    found, most = np.empty((rows, cols), np.int16), np.empty(cols, np.int32)
+    for y in range(rows):
+        found[y], most[:] = 0, weights[0, y]
+        for k in range(1, n):
+            line, names = weights[k, y], found[y]
+            for x in range(cols):
+                names[x] = k if line[x] > most[x] else names[x]
+                most[x] = max(most[x], line[x])
+        for x in range(cols):
+            if not drawn[y, x]:
+                found[y, x] = -1
+    return found

@@ -31,6 +31,8 @@ INSIDE = 256
 """A knot's weight from here on means that it lies inside of the photo; below, that it is near it."""
 FULL = 65535
 """The weight of a photo's centre seen straight down."""
+STRIP_PX = 32
+"""So many rows are drawn at a time: their maps stay near the processor, and little is drawn in vain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +206,7 @@ def warp(
     rows, cols = needed.shape
     out = np.empty((rows * cell_px, cols * cell_px, 3), np.uint8)
     method = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
-    step = max(1, 64 // cell_px)
+    step = max(1, STRIP_PX // cell_px)
     for top in range(0, rows, step):
         bottom = min(top + step, rows)
         wanted = np.flatnonzero(needed[top:bottom].any(0))
@@ -288,12 +290,11 @@ def weight_at(
     u: float, v: float, cos_view: float, width: float, height: float, importance: float, skirt_px: float
 ) -> int:
     """The weight of a photo at one of its pixels, negative beyond its skirt."""
-    # The flatter a ray, the more ground a pixel covers: this way no skirt is wider on the ground.
-    beyond = max(max(-u, u - (width - 1)), max(-v, v - (height - 1))) / (cos_view * cos_view)
-    if beyond >= skirt_px:
-        return -1
+    beyond = max(max(-u, u - (width - 1)), max(-v, v - (height - 1)))
     if beyond > 0:
-        return int((INSIDE - 1) * (1 - beyond / skirt_px))
+        # The flatter a ray, the more ground a pixel covers: this way no skirt is wider on the ground.
+        beyond /= cos_view * cos_view
+        return int((INSIDE - 1) * (1 - beyond / skirt_px)) if beyond < skirt_px else -1
     across, along = 2 * u / (width - 1) - 1, 2 * v / (height - 1) - 1
     share = (1 - across * across) * (1 - along * along) * cos_view * cos_view * cos_view * cos_view
     return INSIDE + int((FULL - INSIDE) * importance * share)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from core.fusion import render
 from core.geometry import Array, Camera, Pose, PosedFrame, World
 from core.grid import MercatorGrid
-from core.seams import CONTEST, REACH_CELLS, settle
+from core.seams import CONTEST, REACH_CELLS, heaviest, settle
 from core.warp import FULL, INSIDE
 
 Rgb = NDArray[np.uint8]
@@ -182,3 +182,10 @@ def test_no_photo_takes_ground_that_it_hardly_sees() -> None:
     own = np.take_along_axis(weights, whose[None], 0)[0].astype(float)
     most = weights.max(0)
     assert ((most - own) <= CONTEST * (most + own) + 1).all()
+
+
+def test_the_heaviest_photo_wins_and_the_first_of_equals() -> None:
+    rng = np.random.default_rng(2)
+    weights = rng.integers(0, 5, (6, 40, 70)).astype(np.int32)
+    drawn = rng.random((40, 70)) < 0.8
+    assert np.array_equal(heaviest(weights, drawn), np.where(drawn, weights.argmax(0), -1))
