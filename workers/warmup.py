@@ -83,8 +83,9 @@ def rendering() -> None:
 
 
 def _border_tile() -> Rgba:
+    """Its alpha rises evenly, so that the file says how each pixel differs from what was foretold."""
     rgba = np.full((TILE_PX, TILE_PX, 4), 200, np.uint8)
-    rgba[TILE_PX // 2 :] = 0
+    rgba[..., 3] = np.indices((TILE_PX, TILE_PX)).sum(0) // 2 % 256
     return rgba
 
 
