@@ -122,10 +122,8 @@ class Sparse(Design):
         self._gain, self._count, self._lens, self._lenses, self._terms = gain, count, lens, lenses, terms
 
     def light(self, answer: Array) -> Array:
-        light = np.where((self._gain >= 0)[:, None], -answer[self._gain], 0.0)
-        wide = self._terms.shape[1]
-        for k in range(wide):
-            light += self._terms[:, k, None] * answer[self._count + wide * self._lens + k]
+        light = np.zeros((len(self._gain), 3))
+        _lighten(self._gain, self._lens, self._terms, self._count, np.ascontiguousarray(answer), light)
         return light
 
     def solve(self, seen: Sightings, weight: Array, prior: Array) -> Array:
@@ -174,6 +172,19 @@ class Sparse(Design):
         columns = np.concatenate((gain, mixed.ravel(), twice, across.ravel()))
         size = n + wide * lenses
         return sparse.csr_matrix((np.concatenate(values), (rows, columns)), shape=(size, size))
+
+
+@compiled
+def _lighten(gain: Index, lens: Index, terms: Array, gains: int, answer: Array, light: Array) -> None:
+    """`Sparse.light` into zeros (M, 3)."""
+    wide = terms.shape[1]
+    for m in range(len(gain)):
+        first = gains + wide * lens[m]
+        for c in range(3):
+            if gain[m] >= 0:
+                light[m, c] = -answer[gain[m], c]
+            for k in range(wide):
+                light[m, c] += terms[m, k] * answer[first + k, c]
 
 
 @compiled
