@@ -196,8 +196,12 @@ def _to_crs(epsg: int) -> Transformer:
 
 
 def utm_epsg(lat_deg: float, lon_deg: float) -> int:
-    """The EPSG code of the WGS84 UTM zone (6° wide, without Norway's exceptions) that holds this place."""
+    """The EPSG code of the WGS84 UTM zone that holds this place: 6° wide, but around Norway."""
     zone = int((lon_deg + 180) % 360 // 6) + 1
+    if 56 <= lat_deg < 64 and 3 <= lon_deg < 12:
+        zone = 32
+    elif 72 <= lat_deg < 84 and 0 <= lon_deg < 42:  # Svalbard: zones 32, 34 and 36 are not used
+        zone = 31 + 2 * int((lon_deg + 3) // 12)
     return (32600 if lat_deg >= 0 else 32700) + zone
 
 

@@ -176,6 +176,16 @@ def test_utm_zones() -> None:
     assert utm_epsg(0.0, 179.9) == 32660
 
 
+def test_norway_and_svalbard_have_the_zones_that_their_surveyors_use() -> None:
+    bergen, stavanger, oslo, shetland = (60.39, 5.32), (58.97, 5.73), (59.91, 10.75), (60.15, -1.15)
+    assert [utm_epsg(*place) for place in (bergen, stavanger, oslo, shetland)] == [32632, 32632, 32632, 32630]
+    assert [
+        utm_epsg(78.2, lon) for lon in (-0.1, 0.0, 8.9, 9.0, 15.6, 20.9, 21.0, 32.9, 33.0, 41.9, 42.0)
+    ] == [32600 + zone for zone in (30, 31, 31, 33, 33, 33, 35, 35, 37, 37, 38)]
+    assert utm_epsg(64.0, 5.0) == utm_epsg(55.9, 5.0) == 32631
+    assert utm_epsg(-60.39, 5.32) == 32731
+
+
 def test_grid_stays_small() -> None:
     code = "import sys, core.grid; print(sorted({'cv2', 'gtsam', 'numba', 'scipy'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
