@@ -7,7 +7,6 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from core.fusion import FrameIndex, FusionParams, Photos, render
 from core.geometry import Array, PosedFrame, World
@@ -175,21 +174,6 @@ def pyramid(natives: Mapping[TileKey, bytes], tile_format: TileFormat = "jpeg") 
         if encoded is not None:
             tiles[tile] = above[tile] = encoded[0]
     return above
-
-
-def inside(outline: Array, points: Array) -> NDArray[np.bool_]:
-    """Which points (N, 2) lie in a convex outline (M, 2) given in order; both in one plane."""
-    edges = np.roll(outline, -1, 0) - outline
-    offsets = points[:, None] - outline
-    side = edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0]
-    return np.asarray((side >= 0).all(1) | (side <= 0).all(1))
-
-
-def samples(tile: TileKey) -> Array:
-    """Points (81, 2) all over the tile and on its edges, pixels of its zoom."""
-    steps = np.linspace(0, TILE_PX, 9)
-    xs, ys = np.meshgrid(tile.x * TILE_PX + steps, tile.y * TILE_PX + steps)
-    return np.column_stack((xs.ravel(), ys.ravel()))
 
 
 def moved_px(before: Array | None, after: Array | None) -> float:

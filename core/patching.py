@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from core.coverage import FUSION, Encoded, block_grid
 from core.fusion import FrameIndex, FusionParams, Photos, render
-from core.geometry import Array, PosedFrame, World
-from core.grid import TILE_PX, MercatorGrid, TileKey
+from core.geometry import PosedFrame, World
+from core.grid import TILE_PX, Columns, MercatorGrid, TileKey
 from core.pyramid import Rgba, TileFormat, encode
 
 CELL_PX = 16
@@ -88,6 +88,14 @@ def _draw(
     lay(canvas[place], fresh)
 
 
+def cells_of(grid: MercatorGrid, world: World) -> Columns:
+    """The plumb lines through the middles of a raster's cells, row by row."""
+    middle = (CELL_PX - 1) / 2
+    cols = grid.col0 + np.arange(0, grid.width, CELL_PX) + middle
+    rows = grid.row0 + np.arange(0, grid.height, CELL_PX) + middle
+    return grid.crossings(world, cols, rows)
+
+
 def holes(
     grid: MercatorGrid,
     world: World,
@@ -102,27 +110,30 @@ def holes(
     """
     rows, cols = wanted.shape
     empty = np.asarray((alpha.reshape(rows, CELL_PX, cols, CELL_PX) == 0).any((1, 3)) & wanted)
-    ys, xs = np.nonzero(empty)
-    middle = (CELL_PX - 1) / 2
-    lines = grid.columns(world, grid.col0 + xs * CELL_PX + middle, grid.row0 + ys * CELL_PX + middle)
-    seen = np.zeros(len(xs), bool)
-    for frame in frames if len(xs) else ():
-        seen |= _sees(frame, lines.at(frame.pose.ground_h_m), CELL_PX * grid.resolution_m(world), params)
+    places = np.flatnonzero(empty)
+    foot, slope = cells_of(grid, world)
+    lines = Columns(foot[places], slope[places])
+    seen = np.zeros(len(places), bool)
+    for frame in frames if len(places) else ():
+        seen |= surely_shows(frame, lines, grid.resolution_m(world), params)
     found = np.zeros_like(empty)
-    found[ys[seen], xs[seen]] = True
+    found.flat[places[seen]] = True
     return found
 
 
-def _sees(frame: PosedFrame, ground: Array, cell_m: float, params: FusionParams) -> Mask:
-    """Whether the frame shows all of the cell around each of these places (N, 2) of its ground plane."""
+def surely_shows(
+    frame: PosedFrame, cells: Columns, resolution_m: float, params: FusionParams = FUSION
+) -> Mask:
+    """Whether the frame shows all of each of these cells (N,), given by the lines through their middles."""
     camera, pose = frame.camera, frame.pose
+    ground = cells.at(pose.ground_h_m)
     rays = np.column_stack((ground, np.full(len(ground), pose.ground_h_m))) - pose.center
     steep = -rays[:, 2] > np.hypot(rays[:, 0], rays[:, 1]) / math.tan(math.radians(params.max_view_deg))
     xyz_cam = rays @ pose.world_R_cam
     ahead = steep & (xyz_cam[:, 2] > 0)
     xyz_cam[~ahead] = (0.0, 0.0, 1.0)
     uv = camera.project(xyz_cam)
-    margin = 1.5 * cell_m / abs(pose.gsd_m(camera))
+    margin = 1.5 * CELL_PX * resolution_m / abs(pose.gsd_m(camera))
     size = np.array([camera.width, camera.height])
     return np.asarray(ahead & ((uv >= margin) & (uv <= size - 1 - margin)).all(1))
 

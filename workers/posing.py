@@ -248,7 +248,7 @@ def changed(before: Layout | None, after: Layout) -> Changes:
     moved = {TileKey(*tile) for tile in off_px}
     there, now = Shown(before), Shown(after)
     grown = {tile for tile in news & shown if not there.is_full(tile)}
-    grown |= {tile for tile in moved & shown if now.sees_any(tile, there.unseen(tile))}
+    grown |= {tile for tile in moved & shown if now.fills_any(tile, there.open(tile))}
     new_tiles: dict[Key, int] = {
         tile: GROWN if tile in shown else NEW for tile in (news | moved) - shown | grown
     }

@@ -4,51 +4,62 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
-from core.coverage import inside, outline_px, samples
-from core.geometry import Array, PosedFrame
-from core.grid import TileKey
+import numpy as np
+from numpy.typing import NDArray
+
+from core.coverage import block_grid
+from core.geometry import PosedFrame
+from core.grid import TILE_PX, Columns, TileKey
 from core.mosaic import Layout
+from core.patching import CELL_PX, cells_of, surely_shows
 from services.catalog.tiles import GROWN, NEW, Key
+
+Cells = NDArray[np.intp]
+"""Places of cells among those of a tile, row by row."""
+_ALL = np.arange((TILE_PX // CELL_PX) ** 2)
 
 
 class Shown:
-    """The tiles of one layout, and what of each no frame shows yet; both are worked out when they are asked.
+    """The tiles of one layout, and which of their cells are open; both are worked out when they are asked.
 
-    The frames of that layout stay as they are; `grow` takes in further ones.
+    A cell is open that no frame surely shows: live drawing fills just those that one does. The frames of
+    that layout stay as they are; `grow` takes in further ones.
     """
 
     def __init__(self, layout: Layout) -> None:
         """All that the layout has by now."""
         self.layout = layout
-        self._outlines: dict[str, Array | None] = {}
-        self._unseen: dict[TileKey, Array] = {}
+        self._open: dict[TileKey, Cells] = {}
         self._to_look_at: dict[TileKey, list[PosedFrame]] = {}
         for frame_id in layout.frames:
             self._add(layout.frames[frame_id], layout.under[frame_id])
 
     def has(self, tile: TileKey) -> bool:
         """Whether any frame lies on the tile."""
-        return tile in self._unseen or tile in self._to_look_at
+        return tile in self._open or tile in self._to_look_at
 
     def is_full(self, tile: TileKey) -> bool:
-        """Whether the frames leave nothing of the tile uncovered."""
-        return self.has(tile) and not len(self.unseen(tile))
+        """Whether the frames leave nothing of the tile open."""
+        return self.has(tile) and not len(self.open(tile))
 
-    def unseen(self, tile: TileKey) -> Array:
-        """Those of the tile's `samples` that no frame sees."""
-        if not self.has(tile):
-            return samples(tile)
-        unseen = self._unseen[tile] if tile in self._unseen else samples(tile)
-        for frame in self._to_look_at.pop(tile, ()):
-            outline = self._outline(frame)
-            if len(unseen) and outline is not None:
-                unseen = unseen[~inside(outline, unseen)]
-        self._unseen[tile] = unseen
-        return unseen
+    def open(self, tile: TileKey) -> Cells:
+        """The tile's cells that are open."""
+        cells = self._open.get(tile, _ALL)
+        frames = self._to_look_at.pop(tile, None)
+        if frames is None:
+            return cells
+        grid, world = block_grid([tile]), self.layout.world
+        foot, slope = cells_of(grid, world)
+        for frame in frames:
+            if len(cells):
+                lines = Columns(foot[cells], slope[cells])
+                cells = cells[~surely_shows(frame, lines, grid.resolution_m(world))]
+        self._open[tile] = cells
+        return cells
 
-    def sees_any(self, tile: TileKey, points: Array) -> bool:
-        """Whether a frame sees any of these of the tile's `samples`."""
-        return len(points) > 0 and not {(x, y) for x, y in points} <= {(x, y) for x, y in self.unseen(tile)}
+    def fills_any(self, tile: TileKey, cells: Cells) -> bool:
+        """Whether any of these cells of the tile is not open."""
+        return not np.isin(cells, self.open(tile)).all()
 
     def grow(self, layout: Layout, new_ids: Collection[str]) -> dict[Key, int]:
         """Take in the frames `new_ids` of the layout; the tiles that look different now, with priorities.
@@ -67,9 +78,3 @@ class Shown:
     def _add(self, frame: PosedFrame, tiles: Iterable[TileKey]) -> None:
         for tile in tiles:
             self._to_look_at.setdefault(tile, []).append(frame)
-
-    def _outline(self, frame: PosedFrame) -> Array | None:
-        if frame.frame_id not in self._outlines:
-            assert self.layout.zoom is not None
-            self._outlines[frame.frame_id] = outline_px(frame, self.layout.world, self.layout.zoom)
-        return self._outlines[frame.frame_id]

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from core.coverage import inside, outline_px, tiles_under
+from core.coverage import block_grid, tiles_under
 from core.geometry import Camera, Pose, PosedFrame, World
 from core.grid import TILE_PX, TileKey
 from core.mosaic import Layout
+from core.patching import CELL_PX, cells_of, surely_shows
 from services.catalog.tiles import GROWN, HEAL, NEW
 from workers.posing import changed
 
@@ -33,15 +34,13 @@ def layout(frames: Mapping[str, PosedFrame]) -> Layout:
 
 
 def seen(tile: TileKey, at: Layout) -> np.ndarray:
-    """Which points of the tile's ground any frame sees."""
-    steps = np.linspace(0, TILE_PX, 9)
-    xs, ys = np.meshgrid(tile.x * TILE_PX + steps, tile.y * TILE_PX + steps)
-    points = np.column_stack((xs.ravel(), ys.ravel()))
-    found = np.zeros(len(points), bool)
+    """Which cells of the tile any frame surely shows: those that live drawing fills."""
+    grid = block_grid([tile])
+    cells, resolution_m = cells_of(grid, WORLD), grid.resolution_m(WORLD)
+    found = np.zeros(len(cells.foot), bool)
     for k, under in at.under.items():
-        outline = outline_px(at.frames[k], WORLD, ZOOM)
-        if tile in under and outline is not None:
-            found |= inside(outline, points)
+        if tile in under:
+            found |= surely_shows(at.frames[k], cells, resolution_m)
     return found
 
 
@@ -67,7 +66,7 @@ def test_what_the_frames_see_is_shown_though_nothing_is_healed(seed: int) -> Non
         after = layout(frames)
         for tile in changed(at, after).dirty(0):
             key = TileKey(*tile)
-            shown[key] = shown.get(key, np.zeros(81, bool)) | seen(key, after)
+            shown[key] = shown.get(key, np.zeros((TILE_PX // CELL_PX) ** 2, bool)) | seen(key, after)
         for tile in after.cover:
             assert not (seen(tile, after) & ~shown[tile]).any(), f"a hole in {tile} after turn {turn}"
         at = after
