@@ -205,9 +205,8 @@ def write_mosaic(
 
     `progress` is told the share drawn, 0 … 1. Raises NothingToMap, BadCrs.
     """
-    checked_crs(crs)
     plan = MosaicPlan.of(world, frames, gsd_m, params, fusion)
-    plan.checked_crs(crs)
+    plan.checked_crs(crs)  # before hours of work
     path.parent.mkdir(parents=True, exist_ok=True)
     pieces = plan.pieces()
     with TemporaryDirectory(dir=path.parent, prefix=".pieces-") as folder:

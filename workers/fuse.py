@@ -45,7 +45,7 @@ class _Sight:
 
     @classmethod
     def of(cls, mission: Mission, known: Poses) -> _Sight:
-        fusion = fusion_of(known.photo_side, mission.tile_side)
+        fusion = _fusion(mission)
         index = FrameIndex([p.posed(known.cameras) for p in known.placed.values()], fusion)
         photos = MissionPhotos(shelf, mission.id, mission.tile_side)
         if known.world is not None and known.zoom is not None:
@@ -118,17 +118,22 @@ def _fuse_group(mission_id: str, group: Sequence[Sequence[TileKey]], clock: Stop
                 clock.spend(tx, mission_id, "fuse")
 
 
+def _fusion(mission: Mission) -> FusionParams:
+    """How the tiles that are drawn now are put together."""
+    return fusion_of(mission.photo_side, mission.tile_side)
+
+
 def _box(mission: Mission, block: Sequence[Key]) -> TileBox:
     """The tiles around the block among those by which poses are found: next to it frames move its seams."""
     finer = max(0, block[0][0] - (mission.zoom or 0))
     xs, ys = [x >> finer for _, x, _ in block], [y >> finer for _, _, y in block]
-    rim = -(-fusion_of(mission.photo_side, mission.tile_side).rim_px // TILE_PX)
+    rim = -(-_fusion(mission).rim_px // TILE_PX)
     return TileBox(block[0][0] - finer, min(xs) - rim, min(ys) - rim, max(xs) + rim, max(ys) + rim)
 
 
 def near(known: Poses, mission: Mission) -> Poses:
     """The same poses, with the tiles that they touch of the zoom that is drawn now."""
-    zoom, fusion = mission.tile_zoom, fusion_of(mission.photo_side, mission.tile_side)
+    zoom, fusion = mission.tile_zoom, _fusion(mission)
     if known.world is None or zoom is None or zoom == known.zoom:
         return known
     found: dict[str, Placed] = {}

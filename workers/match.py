@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -80,7 +80,7 @@ def match(mission_id: str, frame_id: str | None, wanted: Sequence[Key] = ()) -> 
     here = [(a, b) for a, b in wanted if a in mission.metas and b in mission.metas]  # one may be lost
     with db.write(durable=False) as tx:
         mine = pairs.claim(tx, mission_id, frame_id, here)
-    results = [computed(mission_id, pair) for pair in mine]
+    results = [computed(mission_id, mission.metas, pair) for pair in mine]
     with db.write(durable=False) as tx:
         pairs.record(tx, mission_id, results)
         if frame_id is not None:
@@ -106,10 +106,10 @@ def neighbours(gallery: Gallery, frame_id: str) -> list[Key]:
     return gallery.partners(frame_id, LIVE)
 
 
-def computed(mission_id: str, pair: Key) -> PairResult:
-    """One pair, matched."""
+def computed(mission_id: str, metas: Mapping[str, FrameMeta], pair: Key) -> PairResult:
+    """One pair, matched. `metas`: at least those of its frames."""
     low, high = (shelf.features_of(mission_id, f) for f in pair)
-    cameras = [_known[mission_id].metas[f].camera() for f in pair]
+    cameras = [metas[f].camera() for f in pair]
     found = match_pair(pair[0], low, pair[1], high, cameras[0], cameras[1])
     matches = found.to_bytes() if found.accepted else None
     counts = asdict(found.counts)

@@ -12,8 +12,9 @@ import pytest
 from core.mosaic import Mosaic, build, frame_id_of
 from core.photo import probe
 from core.simulation import FlightParams
-from services.catalog import frames, missions, tiles
+from services.catalog import exports, frames, missions, tiles
 from services.settings import get_settings
+from services.tables import Export
 from workers.simulate import simulate
 
 STAGES = ("ingest", "match", "sequence", "fuse", "publish", "export")
@@ -99,6 +100,16 @@ class Bench:
         with self.db.write() as tx:
             missions.request_finalise(tx, self.mission_id)
         self.send("sequence", self.mission_id)
+
+    def export(self, name: str) -> Export:
+        """Asked for, made if it has to be, and as it is then."""
+        with self.db.write() as tx:
+            exports.request(tx, self.mission_id, name)
+        self.handle("export", self.mission_id, name)
+        with self.db.read() as tx:
+            row = exports.get(tx, self.mission_id, name)
+        assert row is not None
+        return row
 
     @property
     def state(self) -> str:

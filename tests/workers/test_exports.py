@@ -21,27 +21,16 @@ def mapped(bench: Any, photos: list[tuple[str, bytes]]) -> Any:
     return bench
 
 
-def ask(bench: Any, name: str) -> Export:
-    """Asked for, made if it has to be, and as it is then."""
-    with bench.db.write() as tx:
-        exports.request(tx, bench.mission_id, name)
-    bench.handle("export", bench.mission_id, name)
-    with bench.db.read() as tx:
-        row = exports.get(tx, bench.mission_id, name)
-    assert row is not None
-    return row
-
-
 def kept(bench: Any) -> list[str]:
     return list(bench.modules["app"].store.list(f"missions/{bench.mission_id}/exports/"))
 
 
 def test_of_a_growing_map_only_the_newest_file_is_kept(mapped: Any, photos: list[tuple[str, bytes]]) -> None:
-    first = ask(mapped, "tiles.pmtiles"), ask(mapped, "route.csv")
+    first = mapped.export("tiles.pmtiles"), mapped.export("route.csv")
     assert kept(mapped) == sorted(str(row.object_key) for row in first)
     mapped.upload(photos[3:])
     mapped.drain()
-    later = ask(mapped, "tiles.pmtiles")
+    later = mapped.export("tiles.pmtiles")
     assert later.object_key != first[0].object_key
     assert kept(mapped) == sorted([str(later.object_key), str(first[1].object_key)])
 
@@ -50,7 +39,7 @@ def test_a_file_that_is_made_again_is_another_one(mapped: Any) -> None:
     """Also of the same map: a download would go on in it."""
     names = set()
     for _ in range(2):
-        row = ask(mapped, "report.json")
+        row = mapped.export("report.json")
         names.add(row.object_key)
         with mapped.db.write() as tx:
             exports.get(tx, mapped.mission_id, "report.json").state = "failed"
@@ -78,10 +67,10 @@ def test_files_of_a_map_that_sharpens_have_no_holes(
         whole = whole or shown
         if max(shown) > max(whole) and partly < 3:
             partly += 1
-            assert tiles_in(bench, ask(bench, "tiles.pmtiles")) == whole
+            assert tiles_in(bench, bench.export("tiles.pmtiles")) == whole
     assert partly
     assert max(bench.tiles()) > max(whole)
-    assert tiles_in(bench, ask(bench, "tiles.pmtiles")) == set(bench.tiles())
+    assert tiles_in(bench, bench.export("tiles.pmtiles")) == set(bench.tiles())
 
 
 def tiles_in(bench: Any, row: Export) -> set[tuple[int, int, int]]:
@@ -143,10 +132,10 @@ def test_a_file_leaves_the_disk_to_photos_and_database(
 ) -> None:
     """And says so, before it is begun or in the middle; what there was of it is gone."""
     full_disk["left"] = room
-    row = ask(mapped, name)
+    row = mapped.export(name)
     assert (row.state, row.error) == ("failed", mapped.modules["export"].NO_ROOM)
     assert not kept(mapped)
     folder = mapped.modules["export"].FOLDER
     assert not [p for p in folder.glob(f"{mapped.mission_id}-*") if p.is_dir()]
     full_disk["left"] = 10**9
-    assert ask(mapped, name).state == "ready"
+    assert mapped.export(name).state == "ready"

@@ -20,7 +20,7 @@ from core.photo import probe
 from core.photo_writer import PhotoTags, write_photo
 from core.scale import KnownScale, Marker
 from core.simulation import Flight, FlightParams, plan_flight
-from services.catalog import exports, frames, missions, poses
+from services.catalog import frames, missions, poses
 from services.report import report
 from workers.simulate import simulate
 
@@ -65,12 +65,7 @@ def marker_in(flight: Flight, number: int) -> Marker:
 
 
 def exported(bench: Any, name: str) -> bytes:
-    with bench.db.write() as tx:
-        exports.request(tx, bench.mission_id, name)
-    bench.handle("export", bench.mission_id, name)
-    with bench.db.read() as tx:
-        row = exports.get(tx, bench.mission_id, name)
-    assert row is not None
+    row = bench.export(name)
     assert row.state == "ready", row.error
     return bytes(bench.modules["app"].store.get(row.object_key))
 

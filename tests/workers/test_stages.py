@@ -206,7 +206,7 @@ def test_two_frames_that_arrive_at_once_are_matched_exactly_once(
     computed: list[tuple[str, str]] = []
     match = bench.modules["match"]
     really = match.computed
-    match.computed = lambda m, pair: computed.append(pair) or really(m, pair)
+    match.computed = lambda m, metas, pair: computed.append(pair) or really(m, metas, pair)
     try:
         for frame_id in [*ids, *ids]:
             bench.handle("match", bench.mission_id, frame_id)
