@@ -175,6 +175,23 @@ def test_live_partners_are_of_the_new_frame_only_and_those_of_all_frames_at_once
     assert union == set(candidates(frames)) >= next_to_each_other(frames)
 
 
+def test_each_reason_alone_finds_live_what_it_finds_in_all_frames_at_once() -> None:
+    frames = [replace(f, drone="ab"[k % 2]) for k, f in enumerate(flight(noise_m=5))]
+    none = NeighbourParams(nearest=0, sectors=0, before_and_after=0, alike=0, alike_without_gps=0)
+    lost = [replace(f, gps=None) for f in frames]
+    for some, params in (
+        (lost, replace(none, before_and_after=2)),
+        (lost, replace(none, alike_without_gps=5)),
+        (frames, replace(none, nearest=4)),
+        (frames, replace(none, nearest=1, sectors=8)),
+        (frames, replace(none, alike=3)),
+    ):
+        gallery = Gallery()
+        gallery.add(some[::-1])
+        found = {pair for f in some for pair in gallery.partners(f.frame_id, params)}
+        assert found == set(candidates(some, params)) != set()
+
+
 def test_live_partners_do_not_depend_on_the_order_of_arrival() -> None:
     frames = [replace(f, gps=None) if k % 5 == 0 else f for k, f in enumerate(flight(noise_m=20))]
     new, others = frames[31], frames[:31] + frames[32:]

@@ -6,12 +6,16 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
+from core.coverage import block_grid, fusion_of, tiles_under
+from core.fusion import overlapping
+from core.geometry import Camera, Pose, PosedFrame, World
 from services.catalog import backlog, frames, missions, tiles
 from services.catalog.tiles import Render
 from services.report import report
-from services.tables import Tile
+from services.tables import Mission, Tile
 
 Photos = list[tuple[str, bytes]]
 
@@ -34,6 +38,29 @@ def in_parts(bench: Any) -> int:
 def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if no photo had come for a long time."""
     monkeypatch.setattr(frames, "quiet_s", lambda *_: math.inf)
+
+
+@pytest.mark.parametrize("photo_side", [1600, 4000, 8000])
+def test_no_frame_that_may_change_a_tile_is_left_out_when_its_poses_are_read(
+    modules: dict[str, Any], photo_side: int
+) -> None:
+    fuse, fusion, zoom = modules["fuse"], fusion_of(photo_side, None), 20
+    world, down = World(47.0, 8.0, 400.0), np.diag([1.0, -1.0, -1.0])
+    mission = Mission(zoom=zoom, photo_side=photo_side, max_side=None, full=False, state="open")
+    camera = Camera(1600, 1200, 1600.0, 799.5, 599.5)
+    at = [PosedFrame(f"{x}", camera, Pose(down, np.array([float(x), 9.0, 120.0]), 0.0)) for x in range(400)]
+    tile = min(tiles_under(at[0], world, zoom, fusion))
+    box, found = fuse._box(mission, [tile]), 0
+    for frame in at:
+        if overlapping(block_grid([tile]), world, [frame], fusion):
+            under = tiles_under(frame, world, zoom, fusion)
+            xs, ys = [t.x for t in under], [t.y for t in under]
+            assert min(xs) <= box.x1
+            assert max(xs) >= box.x0
+            assert min(ys) <= box.y1
+            assert max(ys) >= box.y0
+            found += 1
+    assert 0 < found < len(at)
 
 
 def test_a_mission_whose_photos_come_one_by_one_renders_less_than_two_passes(
